@@ -1,0 +1,2 @@
+//! `bom`: command line of the project.
+fn main() {}

@@ -1,0 +1,7 @@
+//! Scalars that may carry derivatives, rigid transforms, screws.
+
+mod scalar;
+mod se3;
+
+pub use scalar::Real;
+pub use se3::{Pose, Screw, orthonormal_pair, skew};
