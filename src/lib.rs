@@ -17,3 +17,7 @@
 
 pub mod math;
 pub mod types;
+pub mod geometry;
+pub mod registration;
+pub mod mechanism;
+pub mod model;
