@@ -15,6 +15,7 @@
 //! the wall: `math`, `types`, `geometry`, `registration`, `mechanism`, `structure`, `inference`,
 //! `model`, `pipeline`, `io`, `report`.
 
+pub mod io;
 pub mod math;
 pub mod types;
 pub mod geometry;
