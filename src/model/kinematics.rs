@@ -543,6 +543,20 @@ impl<'a> Problem<'a> {
     }
 
     fn finish(self, cost: f64, converged: bool) -> KinematicFit {
+        if std::env::var("DUMP").is_ok() && self.windows.len() > 1 {
+            for (w, window) in self.windows.iter().enumerate() {
+                for frame in 0..window.times_s.len() {
+                    let displacements = forward(&self.joints, |j| self.positions[w][j][frame]);
+                    for (j, joint) in self.joints.iter().enumerate() {
+                        let Some((measured, information)) = self.measurement(w, j, frame) else { continue };
+                        let r = pose_residual(joint, measured, &displacements[j]);
+                        let raw = self.windows[w].poses[&joint.child][frame].unwrap().information;
+                        let tool = window.contacts.iter().enumerate().find(|(_, c)| c.label == joint.child).and_then(|(c, k)| k.track.iter().find(|t| t.0 == frame).map(|t| { let e = self.contact_residual(&displacements[j], &t.1, w, c); (1e3 * e, t.2 * 1e3) }));
+                        eprintln!("DUMP {w} {} j{} q {:.4} chi {:.1} raw {:.1} rot {:.2?} mm {:.2?} sd {:.2?} tool {:?}", window.times_s[frame], joint.child, self.positions[w][j][frame], r.dot(&(information * r)), r.dot(&(raw * r)), (r * 57.3).fixed_rows::<3>(0).as_slice(), (r * 1e3).fixed_rows::<3>(3).as_slice(), (0..6).map(|i| if i < 3 {57.3} else {1e3} / raw[(i,i)].sqrt()).collect::<Vec<_>>(), tool.map(|t| (format!("{:.2?}", t.0.as_slice()), t.1)));
+                    }
+                }
+            }
+        }
         let systems = self.linearize();
         let (matrix, _, _) = self.reduced(&systems, 0.0);
         let globals = matrix.nrows();

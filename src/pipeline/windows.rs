@@ -39,6 +39,7 @@ pub struct FrameAssembler {
     pending: BTreeMap<Stamp, (Vec<usize>, Vec<SegmentedCloud>)>,
     sources: Vec<usize>,
     newest: Option<Stamp>,
+    frames: usize,
 }
 
 impl FrameAssembler {
@@ -53,13 +54,14 @@ impl FrameAssembler {
         clouds.push(cloud);
         let mut ready = Vec::new();
         while let Some(entry) = self.pending.first_entry() {
-            let complete = entry.get().0.len() >= self.sources.len() && !ready.is_empty()
-                || Some(*entry.key()) < self.newest;
+            let all_sources = self.frames > 0 && entry.get().0.len() >= self.sources.len();
+            let complete = all_sources || Some(*entry.key()) < self.newest;
             if !complete {
                 break;
             }
             let (stamp, (_, clouds)) = entry.remove_entry();
             ready.push((stamp, clouds));
+            self.frames += 1;
         }
         ready
     }
