@@ -22,4 +22,5 @@ pub mod mechanism;
 pub mod model;
 pub mod pipeline;
 pub mod registration;
+pub mod structure;
 pub mod types;

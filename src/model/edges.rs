@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::Vector3;
 
-use super::kinematics::{Axis, KinematicJoint, KinematicSettings, fit_kinematics};
+use super::kinematics::{AXIS_POINT_PRIOR, Axis, KinematicJoint, KinematicSettings, fit_kinematics};
 use super::window::{Contact, PoseMeasurement, WindowObservations};
 use crate::math::{Pose, Screw, orthonormal_pair};
 use crate::mechanism::JointType;
@@ -18,8 +18,6 @@ use crate::types::Label;
 
 /// Cost of one move \[nats\].
 pub const MOVE_COST: f64 = 3.0;
-/// Standard deviation of an axis point's prior about the part \[m\].
-const AXIS_POINT_PRIOR: f64 = 0.5;
 /// Standard deviation of a direction's prior \[rad\].
 const AXIS_DIRECTION_PRIOR: f64 = 1.0;
 /// Frames of one scene are not independent looks: their evidence is raised to this power.

@@ -18,6 +18,10 @@ use crate::math::{Pose, Screw, orthonormal_pair};
 use crate::mechanism::JointType;
 use crate::types::Label;
 
+/// Standard deviation of a hinge's distance from its part's reference point, per direction \[m\]:
+/// furniture-sized parts turn about axes within a metre or so.
+pub const AXIS_POINT_PRIOR: f64 = 0.5;
+
 /// A joint axis in world at the reference configuration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Axis {
@@ -324,6 +328,9 @@ impl<'a> Problem<'a> {
 
     fn cost(&self) -> f64 {
         let mut cost = 0.5 * self.tool_offset.norm_squared() / self.settings.tool_offset_sigma.powi(2);
+        for joint in self.joints.iter().filter(|j| j.joint_type == JointType::Revolute) {
+            cost += 0.5 * (joint.axis.point - joint.center).norm_squared() / AXIS_POINT_PRIOR.powi(2);
+        }
         for (w, window) in self.windows.iter().enumerate() {
             for frame in 0..window.times_s.len() {
                 let displacements = forward(&self.joints, |j| self.positions[w][j][frame]);
@@ -434,9 +441,16 @@ impl<'a> Problem<'a> {
         let globals = self.global_count();
         let mut matrix = DMatrix::zeros(globals, globals);
         let mut gradient = DVector::zeros(globals);
-        // One radian and one metre: a proper prior that the data outweigh.
-        for i in 0..globals - 3 {
-            matrix[(i, i)] += 1.0;
+        let mut at = 0;
+        for joint in &self.joints {
+            let arm = joint.axis.point - joint.center;
+            let (first, second) = orthonormal_pair(&joint.axis.direction);
+            for (i, pull) in [0.0, 0.0, arm.dot(&first), arm.dot(&second)].into_iter().take(joint.axis_parameters()).enumerate() {
+                let information = if i < 2 { 1.0 } else { AXIS_POINT_PRIOR.powi(-2) };
+                matrix[(at + i, at + i)] += information;
+                gradient[at + i] += information * pull;
+            }
+            at += joint.axis_parameters();
         }
         let offset_information = 1.0 / self.settings.tool_offset_sigma.powi(2);
         for i in 0..3 {

@@ -24,6 +24,8 @@ const EXPLAINED: f64 = 0.12;
 const TOOL_EXPLAINED: f64 = 0.003;
 /// Share of the largest eigenvalue of a factor that rough normals may pretend to hold.
 pub const FALSE_SHARE: f64 = 0.01;
+/// A linearization is believed about this far \[m\]: weaker directions stay as predicted.
+const MEASURED_WITHIN: f64 = 0.010;
 /// Scans with fewer points say nothing of a pose.
 pub const FEWEST_POINTS: usize = 25;
 
@@ -339,22 +341,17 @@ pub fn measure(model: &PartModel, scan: &[ScanPoint], predicted: &Pose, settings
 /// The pose measurement of a factor taken at `predicted`.
 pub fn measurement_of(model: &PartModel, factor: &PoseFactor, predicted: &Pose) -> PoseMeasurement {
     let information = factor.information(model.radius, FALSE_SHARE);
-    let weak = Vector6::new(model.radius, model.radius, model.radius, 1.0, 1.0, 1.0).map(|s| s * s * 1e2);
+    let weak = Vector6::new(model.radius, model.radius, model.radius, 1.0, 1.0, 1.0).map(|s| s * s / MEASURED_WITHIN.powi(2));
     let step = (information + Matrix6::from_diagonal(&weak))
         .cholesky()
         .map_or_else(Vector6::zeros, |c| -c.solve(&factor.gradient));
     let length = step.fixed_rows::<3>(0).norm() * model.radius + step.fixed_rows::<3>(3).norm();
-    let step = if length > settings_cap() { step * (settings_cap() / length) } else { step };
+    let step = if length > 3.0 * MEASURED_WITHIN { step * (3.0 * MEASURED_WITHIN / length) } else { step };
     let displacement = *predicted
         * Pose::from_translation(model.centroid)
         * Pose::exp(&step)
         * Pose::from_translation(-model.centroid);
     PoseMeasurement { displacement, information }
-}
-
-/// A single linearization is not believed further than this \[m\].
-fn settings_cap() -> f64 {
-    0.03
 }
 
 fn best_seed_count(reached: f64) -> usize {
