@@ -16,4 +16,5 @@
 //! `model`, `pipeline`, `io`, `report`.
 
 pub mod math;
+pub mod mechanism;
 pub mod types;
