@@ -1,7 +1,11 @@
-//! Applied wrenches over time: samples between which they are linear, with bias and delay.
+//! Applied wrenches over time: samples, with bias and delay.
+//!
+//! Between two samples the wrench about the world origin is linear in time (about the carried point,
+//! where the contact moves with the body).
 
 use nalgebra::Vector3;
 
+use super::inertia::Spatial;
 use super::step::{BodyWrench, WrenchOrigin};
 use crate::math::Real;
 
@@ -60,23 +64,28 @@ impl<'a, T: Real> WrenchTrack<'a, T> {
     /// The wrench acting at `time_s`. `cursor` remembers the place in the samples between calls and
     /// changes nothing but the cost; start it at zero.
     pub fn wrench(&self, time_s: f64, cursor: &mut usize) -> BodyWrench<T> {
-        let place = self.locate(time_s, cursor);
-        let (reading, weight) = (&self.samples[place.first..], place.weight);
-        let between = |of: fn(&WrenchSample) -> &Vector3<f64>| match weight {
-            Some(weight) => {
-                let (a, b) = (of(&reading[0]), of(&reading[1]));
-                a.zip_map(b, |a, b| T::constant(a) + weight * T::constant(b - a))
-            }
-            None => reading.first().map_or_else(Vector3::zeros, |reading| of(reading).map(T::constant)),
+        let Place { first, weight } = self.locate(time_s, cursor);
+        let at = |i: usize| self.samples.get(i).map_or_else(Spatial::zero, |s| self.reading(s));
+        let mut wrench = at(first);
+        if let Some(weight) = weight {
+            wrench += (at(first + 1) + wrench * -T::one()) * weight;
+        }
+        let point = match self.point {
+            WrenchPoint::Recorded => WrenchOrigin::World(Vector3::zeros()),
+            WrenchPoint::Carried(point) => WrenchOrigin::Carried(point),
         };
-        BodyWrench {
-            body: self.body,
-            point: match self.point {
-                WrenchPoint::Recorded => WrenchOrigin::World(between(|s| &s.point_in_world)),
-                WrenchPoint::Carried(point) => WrenchOrigin::Carried(point),
-            },
-            force: between(|s| &s.force_in_world) - self.force_bias,
-            torque: between(|s| &s.torque_in_world) - self.torque_bias,
+        BodyWrench { body: self.body, point, force: wrench.linear, torque: wrench.angular }
+    }
+
+    /// A reading without bias: about the world origin, or about the carried point.
+    pub(super) fn reading(&self, sample: &WrenchSample) -> Spatial<T> {
+        let force = sample.force_in_world.map(T::constant) - self.force_bias;
+        let torque = sample.torque_in_world.map(T::constant) - self.torque_bias;
+        match self.point {
+            WrenchPoint::Recorded => {
+                Spatial::wrench_at(&sample.point_in_world.map(T::constant), force, &torque)
+            }
+            WrenchPoint::Carried(_) => Spatial { angular: torque, linear: force },
         }
     }
 
@@ -130,7 +139,9 @@ mod tests {
         let samples = [sample(1.0, 0.0), sample(2.0, 4.0), sample(4.0, 0.0)];
         let mut track = WrenchTrack::new(0, &samples);
         let mut cursor = 0;
-        for (time_s, force) in [(0.0, 0.0), (1.25, 1.0), (3.0, 2.0), (1.5, 2.0), (5.0, 0.0), (0.5, 0.0)] {
+        for (time_s, force) in
+            [(0.0, 0.0), (1.25, 1.0), (3.0, 2.0), (1.5, 2.0), (5.0, 0.0), (0.5, 0.0)]
+        {
             assert_eq!(track.wrench(time_s, &mut cursor).force.x, force, "at {time_s}");
         }
         track.delay_s = 0.25;

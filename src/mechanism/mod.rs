@@ -17,6 +17,8 @@ mod parameters;
 mod rollout;
 mod single;
 mod step;
+#[cfg(test)]
+mod tests;
 mod tree;
 mod workspace;
 
@@ -24,7 +26,7 @@ pub use forcing::{WrenchPoint, WrenchSample, WrenchTrack};
 pub use friction::{FrictionBounds, soft_threshold};
 pub use inertia::{Spatial, SpatialInertia};
 pub use joint::JointType;
-pub use limits::{DEFAULT_LIMIT_SOFTNESS_S, Limit};
+pub use limits::{Approach, DEFAULT_LIMIT_SOFTNESS_S, Limit, LimitFlow};
 pub use parameters::{JointForces, JointParameters};
 pub use rollout::{RolloutError, Trajectory, rollout};
 pub use single::{SingleJoint, SingleState};

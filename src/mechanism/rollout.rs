@@ -184,11 +184,7 @@ impl<'t, 'a, T: Real> Drive<'t, 'a, T> {
     }
 
     fn at_sample(&self, i: usize) -> T {
-        let track = self.track;
-        let Some(sample) = track.samples.get(i) else { return T::zero() };
-        let point = sample.point_in_world.map(T::constant);
-        let force = sample.force_in_world.map(T::constant) - track.force_bias;
-        let torque = sample.torque_in_world.map(T::constant) - track.torque_bias;
-        self.screw.dot(&Spatial::wrench_at(&point, force, &torque))
+        let reading = self.track.samples.get(i).map(|sample| self.track.reading(sample));
+        reading.map_or_else(T::zero, |wrench| self.screw.dot(&wrench))
     }
 }

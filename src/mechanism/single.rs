@@ -6,10 +6,12 @@
 use super::effects::JointState;
 use super::inertia::Spatial;
 use super::joint::JointType;
+use super::limits::Approach;
 use super::parameters::JointParameters;
 use super::step::{ImplicitDamping, middle_rate, row};
 use super::tree::Tree;
 use crate::math::Real;
+use nalgebra::Vector3;
 
 /// One joint and all that moves with it.
 #[derive(Clone, Debug)]
@@ -59,7 +61,9 @@ impl<'a, T: Real> SingleJoint<'a, T> {
         let screw = Spatial::from(&joint.screw.0);
         let momentum = lumped.momentum(&screw);
         let g = tree.gravity().map(T::constant);
-        let gravity = if joint.joint == JointType::Revolute {
+        let gravity = if tree.gravity() == Vector3::zeros() {
+            Gravity::Constant(T::zero())
+        } else if joint.joint == JointType::Revolute {
             // d/dq of g · R(q) m (c − p): n × r at q = 0, and its derivative n × (n × r).
             let axis = screw.angular;
             let point = axis.cross(&screw.linear);
@@ -67,13 +71,6 @@ impl<'a, T: Real> SingleJoint<'a, T> {
             Gravity::Turning(tangent.dot(&g), axis.cross(&tangent).dot(&g))
         } else {
             Gravity::Constant(screw.linear.dot(&g) * lumped.mass)
-        };
-        let is_none = |x: &T| x.value() == 0.0 && *x == T::zero();
-        let gravity = match gravity {
-            Gravity::Turning(a, b) if tree.gravity() == nalgebra::Vector3::zeros() && is_none(&a) && is_none(&b) => {
-                Gravity::Constant(T::zero())
-            }
-            other => other,
         };
         Some(Self {
             body,
@@ -114,9 +111,12 @@ impl<'a, T: Real> SingleJoint<'a, T> {
         let damping = ImplicitDamping::new(forces.damping, self.inertia, step_s);
         let impulse = (self.inertia - damping.before) * rate
             + (applied + self.gravity_force(middle) + forces.force) * h;
-        let row = row(self.parameters, &forces, state.position, rate, step_s);
+        let approach =
+            Approach { position: state.position, rate, gained: rate - state.rate_before, step_s };
+        let row = row(self.parameters, &forces, &approach);
         state.rate_before = rate;
-        state.rate = row.proximal(self.inertia + damping.after, impulse);
-        state.position = middle + state.rate * half;
+        state.rate = row.proximal(self.inertia + damping.after, impulse, rate);
+        state.position =
+            row.limited_position(state.rate).unwrap_or_else(|| middle + state.rate * half);
     }
 }

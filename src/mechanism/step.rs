@@ -13,6 +13,7 @@
 use super::effects::JointState;
 use super::friction::{FrictionBounds, Row, solve};
 use super::inertia::Spatial;
+use super::limits::Approach;
 use super::parameters::{JointForces, JointParameters};
 use super::tree::Tree;
 use super::workspace::Workspace;
@@ -101,9 +102,8 @@ pub fn step<T: Real>(
     workspace.rows.clear();
     for (k, &body) in tree.moving.iter().enumerate() {
         let rate = workspace.rates[k];
-        let momentum = (0..n).fold(T::zero(), |sum, j| {
-            sum + workspace.mass_matrix[k * n + j] * workspace.rates[j]
-        });
+        let momentum = (0..n)
+            .fold(T::zero(), |sum, j| sum + workspace.mass_matrix[k * n + j] * workspace.rates[j]);
         let applied = workspace.applied[k] - workspace.bias[k];
         let parameters = &tree.bodies()[body].parameters;
         let joint = JointState {
@@ -113,10 +113,17 @@ pub fn step<T: Real>(
             step_s: step.length_s,
         };
         let forces = parameters.forces(&joint);
-        let damping = ImplicitDamping::new(forces.damping, workspace.mass_matrix[k * n + k], step.length_s);
+        let damping =
+            ImplicitDamping::new(forces.damping, workspace.mass_matrix[k * n + k], step.length_s);
         workspace.applied[k] = momentum - damping.before * rate
             + (applied + forces.force) * T::constant(step.length_s);
-        workspace.rows.push(row(parameters, &forces, state.positions[body], rate, step.length_s));
+        let approach = Approach {
+            position: state.positions[body],
+            rate,
+            gained: rate - state.rates_before[body],
+            step_s: step.length_s,
+        };
+        workspace.rows.push(row(parameters, &forces, &approach));
         workspace.bias[k] = damping.after;
     }
     for k in 0..n {
@@ -126,13 +133,20 @@ pub fn step<T: Real>(
     let Workspace { mass_matrix, applied, rows, rates, solve: scratch, .. } = workspace;
     solve(mass_matrix, applied, rows, rates, scratch);
     for (k, &body) in tree.moving.iter().enumerate() {
-        state.positions[body] = workspace.middle[body] + workspace.rates[k] * half;
+        let rate = workspace.rates[k];
+        state.positions[body] = workspace.rows[k]
+            .limited_position(rate)
+            .unwrap_or_else(|| workspace.middle[body] + rate * half);
         state.rates_before[body] = state.rates[body];
-        state.rates[body] = workspace.rates[k];
+        state.rates[body] = rate;
     }
 }
 
-fn apply_wrenches<T: Real>(tree: &Tree<T>, wrenches: &[BodyWrench<T>], workspace: &mut Workspace<T>) {
+fn apply_wrenches<T: Real>(
+    tree: &Tree<T>,
+    wrenches: &[BodyWrench<T>],
+    workspace: &mut Workspace<T>,
+) {
     workspace.applied.fill(T::zero());
     for wrench in wrenches {
         let point = match wrench.point {
@@ -159,18 +173,16 @@ pub(super) fn middle_rate<T: Real>(rate: T, before: T) -> T {
 pub(super) fn row<T: Real>(
     parameters: &JointParameters<T>,
     forces: &JointForces<T>,
-    position: T,
-    rate: T,
-    step_s: f64,
+    approach: &Approach<T>,
 ) -> Row<T> {
-    let h = T::constant(step_s);
+    let h = T::constant(approach.step_s);
     Row {
         friction: FrictionBounds {
             against_plus: forces.friction.against_plus * h,
             against_minus: forces.friction.against_minus * h,
         },
-        least: parameters.lower.and_then(|limit| limit.least_rate(position, rate, step_s)),
-        greatest: parameters.upper.and_then(|limit| limit.greatest_rate(position, rate, step_s)),
+        least: parameters.lower.and_then(|limit| limit.as_lower(approach)),
+        greatest: parameters.upper.and_then(|limit| limit.as_upper(approach)),
     }
 }
 

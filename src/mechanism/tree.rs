@@ -232,7 +232,8 @@ impl<T: Real> Tree<T> {
     /// per moving joint.
     pub(super) fn update_bias(&self, rates: &[T], workspace: &mut Workspace<T>) {
         let Workspace { screws, inertias, twists, accelerations, forces, bias, .. } = workspace;
-        let upward = Spatial { angular: Vector3::zeros(), linear: self.gravity.map(|g| T::constant(-g)) };
+        let upward =
+            Spatial { angular: Vector3::zeros(), linear: self.gravity.map(|g| T::constant(-g)) };
         for k in 0..self.moving.len() {
             let (twist, acceleration) = match self.parents[k] {
                 Some(parent) => (twists[parent], accelerations[parent]),
@@ -346,9 +347,15 @@ fn joint_displacement<T: Real>(joint: JointType, screw: &Spatial<T>, q: T) -> Po
             let turned = axis * axis.transpose() * (T::one() - cos);
             let s = axis * sin;
             let rotation = Matrix3::new(
-                turned[(0, 0)] + cos, turned[(0, 1)] - s.z, turned[(0, 2)] + s.y,
-                turned[(1, 0)] + s.z, turned[(1, 1)] + cos, turned[(1, 2)] - s.x,
-                turned[(2, 0)] - s.y, turned[(2, 1)] + s.x, turned[(2, 2)] + cos,
+                turned[(0, 0)] + cos,
+                turned[(0, 1)] - s.z,
+                turned[(0, 2)] + s.y,
+                turned[(1, 0)] + s.z,
+                turned[(1, 1)] + cos,
+                turned[(1, 2)] - s.x,
+                turned[(2, 0)] - s.y,
+                turned[(2, 1)] + s.x,
+                turned[(2, 2)] + cos,
             );
             let point = axis.cross(&screw.linear);
             Pose { rotation, translation: point - rotation * point }

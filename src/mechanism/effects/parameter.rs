@@ -42,12 +42,48 @@ impl Dimension {
     pub fn unit(self, joint: JointType) -> &'static str {
         let turns = joint == JointType::Revolute;
         match self {
-            Self::Force => if turns { "N·m" } else { "N" },
-            Self::Position => if turns { "rad" } else { "m" },
-            Self::Rate => if turns { "rad/s" } else { "m/s" },
-            Self::Stiffness => if turns { "N·m/rad" } else { "N/m" },
-            Self::Damping => if turns { "N·m·s/rad" } else { "N·s/m" },
-            Self::Drag => if turns { "N·m·s²/rad²" } else { "N·s²/m²" },
+            Self::Force => {
+                if turns {
+                    "N·m"
+                } else {
+                    "N"
+                }
+            }
+            Self::Position => {
+                if turns {
+                    "rad"
+                } else {
+                    "m"
+                }
+            }
+            Self::Rate => {
+                if turns {
+                    "rad/s"
+                } else {
+                    "m/s"
+                }
+            }
+            Self::Stiffness => {
+                if turns {
+                    "N·m/rad"
+                } else {
+                    "N/m"
+                }
+            }
+            Self::Damping => {
+                if turns {
+                    "N·m·s/rad"
+                } else {
+                    "N·s/m"
+                }
+            }
+            Self::Drag => {
+                if turns {
+                    "N·m·s²/rad²"
+                } else {
+                    "N·s²/m²"
+                }
+            }
             Self::Phase => "rad",
             Self::Time => "s",
         }
@@ -100,7 +136,12 @@ pub struct Parameter {
 
 impl Parameter {
     /// A positive parameter: median in units of its scale, standard deviation of its logarithm.
-    pub const fn positive(name: &'static str, dimension: Dimension, median: f64, log_sd: f64) -> Self {
+    pub const fn positive(
+        name: &'static str,
+        dimension: Dimension,
+        median: f64,
+        log_sd: f64,
+    ) -> Self {
         Self { name, dimension, prior: Prior::LogNormal { median, log_sd } }
     }
 
@@ -116,7 +157,9 @@ impl Parameter {
             Prior::LogNormal { median, log_sd } => {
                 (theta * T::constant(log_sd)).exp() * T::constant(median * scale)
             }
-            Prior::Normal { mean, sd } => (theta * T::constant(sd) + T::constant(mean)) * T::constant(scale),
+            Prior::Normal { mean, sd } => {
+                (theta * T::constant(sd) + T::constant(mean)) * T::constant(scale)
+            }
         }
     }
 

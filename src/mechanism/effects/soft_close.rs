@@ -19,7 +19,7 @@ impl Effect for SoftClose {
     fn force<T: Real>(parameters: &[T], joint: &JointState<T>) -> T {
         let [range, stiffness, pull] = [parameters[0], parameters[1], parameters[2]];
         let x = joint.position;
-        let pull = pull * (x / T::constant(PULL_WIDTH)).tanh();
+        let pull = pull * tanh(x / T::constant(PULL_WIDTH));
         -(stiffness * x + pull) * engaged(x, range)
     }
 
@@ -40,5 +40,10 @@ const EDGE_WIDTH: f64 = 0.001;
 
 /// One where x < range, zero beyond.
 fn engaged<T: Real>(x: T, range: T) -> T {
-    (T::one() + ((range - x) / T::constant(EDGE_WIDTH)).tanh()) * T::constant(0.5)
+    (T::one() + tanh((range - x) / T::constant(EDGE_WIDTH))) * T::constant(0.5)
+}
+
+/// tanh, exactly ±1 beyond 20 (where it is within 1e-17): dual numbers take sinh/cosh and overflow.
+fn tanh<T: Real>(x: T) -> T {
+    if x.value().abs() > 20.0 { T::constant(x.value().signum()) } else { x.tanh() }
 }
