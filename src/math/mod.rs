@@ -1,5 +1,7 @@
 //! Scalars that may carry derivatives, rigid transforms, screws.
 
+#[doc(hidden)]
+pub mod gradient;
 mod scalar;
 mod se3;
 

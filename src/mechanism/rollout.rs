@@ -1,0 +1,190 @@
+//! Simulation from an initial state over a grid of times.
+
+use thiserror::Error;
+
+use super::forcing::{WrenchPoint, WrenchTrack};
+use super::inertia::Spatial;
+use super::single::{SingleJoint, SingleState};
+use super::step::{BodyWrench, State, Step, step};
+use super::tree::Tree;
+use super::workspace::Workspace;
+use crate::math::Real;
+
+/// States of all joints at the requested times.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Trajectory<T: Real> {
+    body_count: usize,
+    positions: Vec<T>,
+    rates: Vec<T>,
+}
+
+impl<T: Real> Trajectory<T> {
+    /// How many times it has.
+    pub fn len(&self) -> usize {
+        self.positions.len() / self.body_count.max(1)
+    }
+
+    /// Whether it has none.
+    pub fn is_empty(&self) -> bool {
+        self.positions.is_empty()
+    }
+
+    /// q at the i-th time, one per body \[m or rad\].
+    pub fn positions(&self, i: usize) -> &[T] {
+        &self.positions[i * self.body_count..(i + 1) * self.body_count]
+    }
+
+    /// q̇ at the i-th time, one per body \[m/s or rad/s\].
+    pub fn rates(&self, i: usize) -> &[T] {
+        &self.rates[i * self.body_count..(i + 1) * self.body_count]
+    }
+
+    fn push(&mut self, positions: &[T], rates: &[T]) {
+        self.positions.extend_from_slice(positions);
+        self.rates.extend_from_slice(rates);
+    }
+}
+
+/// Why a simulation gave no trajectory.
+#[derive(Clone, Debug, PartialEq, Error)]
+pub enum RolloutError {
+    /// A position or rate that is not finite: parameters beyond what a step can carry.
+    #[error("simulation diverged before {time_s} s")]
+    Diverged {
+        /// The first requested time without a finite state \[s\].
+        time_s: f64,
+    },
+}
+
+/// Simulates `tree` from `initial` at `times_s[0]` through all of `times_s`, ascending, in equal
+/// steps of at most `step_max_s` between two of them.
+pub fn rollout<T: Real>(
+    tree: &Tree<T>,
+    initial: &State<T>,
+    tracks: &[WrenchTrack<'_, T>],
+    times_s: &[f64],
+    step_max_s: f64,
+) -> Result<Trajectory<T>, RolloutError> {
+    let carried = tracks.iter().any(|track| track.point != WrenchPoint::Recorded);
+    match SingleJoint::of(tree) {
+        Some(joint) if !carried => {
+            rollout_single(tree, &joint, initial, tracks, times_s, step_max_s)
+        }
+        _ => rollout_tree(tree, initial, tracks, times_s, step_max_s),
+    }
+}
+
+fn rollout_tree<T: Real>(
+    tree: &Tree<T>,
+    initial: &State<T>,
+    tracks: &[WrenchTrack<'_, T>],
+    times_s: &[f64],
+    step_max_s: f64,
+) -> Result<Trajectory<T>, RolloutError> {
+    let mut workspace = Workspace::new(tree);
+    let mut state = initial.clone();
+    let mut cursors = vec![0; tracks.len()];
+    let mut wrenches: Vec<BodyWrench<T>> = Vec::with_capacity(tracks.len());
+    let mut trajectory = empty_trajectory(tree.body_count(), times_s.len());
+    for (i, &end_s) in times_s.iter().enumerate() {
+        for Step { middle_s, length_s } in steps(times_s, i, step_max_s) {
+            wrenches.clear();
+            for (track, cursor) in tracks.iter().zip(&mut cursors) {
+                wrenches.push(track.wrench(middle_s, cursor));
+            }
+            step(tree, &mut state, &wrenches, Step { middle_s, length_s }, &mut workspace);
+        }
+        if !state.positions.iter().chain(&state.rates).all(|x| x.value().is_finite()) {
+            return Err(RolloutError::Diverged { time_s: end_s });
+        }
+        trajectory.push(&state.positions, &state.rates);
+    }
+    Ok(trajectory)
+}
+
+fn rollout_single<T: Real>(
+    tree: &Tree<T>,
+    joint: &SingleJoint<'_, T>,
+    initial: &State<T>,
+    tracks: &[WrenchTrack<'_, T>],
+    times_s: &[f64],
+    step_max_s: f64,
+) -> Result<Trajectory<T>, RolloutError> {
+    let mut drives: Vec<Drive<'_, '_, T>> = tracks
+        .iter()
+        .filter(|track| tree.carriers[track.body].is_some())
+        .map(|track| Drive::new(joint.screw, track))
+        .collect();
+    let mut positions = initial.positions.clone();
+    let mut rates = initial.rates.clone();
+    let mut state = SingleState::new(positions[joint.body], rates[joint.body]);
+    let mut trajectory = empty_trajectory(tree.body_count(), times_s.len());
+    for (i, &end_s) in times_s.iter().enumerate() {
+        for Step { middle_s, length_s } in steps(times_s, i, step_max_s) {
+            let applied =
+                drives.iter_mut().fold(T::zero(), |sum, drive| sum + drive.force(middle_s));
+            joint.step(&mut state, applied, middle_s, length_s);
+        }
+        if !(state.position.value().is_finite() && state.rate.value().is_finite()) {
+            return Err(RolloutError::Diverged { time_s: end_s });
+        }
+        positions[joint.body] = state.position;
+        rates[joint.body] = state.rate;
+        trajectory.push(&positions, &rates);
+    }
+    Ok(trajectory)
+}
+
+fn empty_trajectory<T: Real>(body_count: usize, times: usize) -> Trajectory<T> {
+    Trajectory {
+        body_count,
+        positions: Vec::with_capacity(body_count * times),
+        rates: Vec::with_capacity(body_count * times),
+    }
+}
+
+/// The steps that lead to the i-th time.
+fn steps(times_s: &[f64], i: usize, step_max_s: f64) -> impl Iterator<Item = Step> {
+    let start_s = times_s[i.saturating_sub(1)];
+    let span_s = times_s[i] - start_s;
+    // A span that is a whole number of steps but for rounding takes that number.
+    let count = (span_s / step_max_s - 1e-9).ceil().max(0.0) as usize;
+    let length_s = span_s / count.max(1) as f64;
+    (0..count).map(move |k| Step { middle_s: start_s + (k as f64 + 0.5) * length_s, length_s })
+}
+
+/// Sᵀ w over a track, for a joint whose S never changes: one linear function between two samples.
+struct Drive<'t, 'a, T: Real> {
+    screw: Spatial<T>,
+    track: &'t WrenchTrack<'a, T>,
+    cursor: usize,
+    /// Index of the sample that the next two belong to.
+    first: Option<usize>,
+    at_first: T,
+    at_next: T,
+}
+
+impl<'t, 'a, T: Real> Drive<'t, 'a, T> {
+    fn new(screw: Spatial<T>, track: &'t WrenchTrack<'a, T>) -> Self {
+        Self { screw, track, cursor: 0, first: None, at_first: T::zero(), at_next: T::zero() }
+    }
+
+    #[inline]
+    fn force(&mut self, time_s: f64) -> T {
+        let place = self.track.locate(time_s, &mut self.cursor);
+        if self.first != Some(place.first) {
+            self.first = Some(place.first);
+            self.at_first = self.at_sample(place.first);
+            self.at_next = self.at_sample(place.first + 1);
+        }
+        match place.weight {
+            Some(weight) => self.at_first + (self.at_next - self.at_first) * weight,
+            None => self.at_first,
+        }
+    }
+
+    fn at_sample(&self, i: usize) -> T {
+        let reading = self.track.samples.get(i).map(|sample| self.track.reading(sample));
+        reading.map_or_else(T::zero, |wrench| self.screw.dot(&wrench))
+    }
+}
