@@ -21,6 +21,9 @@ use nalgebra::{UnitQuaternion, Vector3};
 use proptest::prelude::*;
 use serde::Serialize;
 
+/// A way to spoil a cloud, and the reason it is then dropped for.
+type Spoiled = (&'static str, fn(&mut PointCloud2));
+
 fn bytes<T: Serialize>(message: &T) -> Vec<u8> {
     cdr::encode(message, Endianness::Little).unwrap()
 }
@@ -296,7 +299,7 @@ fn duplicate_and_backward_stamps_are_dropped_frame_by_frame() {
 #[test]
 fn bad_clouds_are_named_and_good_ones_still_used() {
     let mut feed = Feed::new();
-    let changes: [(&str, fn(&mut PointCloud2)); 7] = [
+    let changes: [Spoiled; 7] = [
         ("no_label_field", |c| c.fields.truncate(3)),
         ("no_coordinate_field", |c| {
             c.fields.remove(0);

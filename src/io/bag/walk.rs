@@ -317,7 +317,7 @@ fn read_summary(reader: &mut BufReader<&File>, length: u64) -> Option<Summary> {
                 let mut fields = Fields(body);
                 // Message, schema, channel, attachment, metadata and chunk counts, start and end.
                 fields.bytes(8 + 2 + 4 + 4 + 4 + 4 + 8 + 8)?;
-                let mut counts = Fields(fields.bytes(4).and_then(|_| Some(fields.0))?);
+                let mut counts = Fields(fields.bytes(4).map(|_| fields.0)?);
                 while let (Some(channel), Some(count)) = (counts.u16(), counts.u64()) {
                     summary.counts.insert(channel, count);
                 }
