@@ -1,0 +1,3 @@
+//! stub until merged
+mod joint;
+pub use joint::JointType;
