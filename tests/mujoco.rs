@@ -111,6 +111,9 @@ fn worst_error(chain: &Chain, step_s: f64) -> f64 {
         (0..chain.positions.len()).map(|i| i as f64 * chain.output_period_s).collect();
     let start = State::at_rest(chain.bodies.len());
     let run = rollout(&tree, &start, &[track], &times, step_s).unwrap();
+    if std::env::var_os("DBG").is_some() && step_s < 6e-4 {
+        for (i, e) in chain.positions.iter().enumerate() { eprintln!("{} {:?} {:?}", times[i], e, e.iter().zip(run.positions(i)).map(|(a,b)| 1e3*(b-a)).collect::<Vec<_>>()); }
+    }
     let errors = chain.positions.iter().enumerate().flat_map(|(i, expected)| {
         run.positions(i).iter().zip(expected).map(|(q, expected)| (q - expected).abs())
     });

@@ -65,15 +65,15 @@ impl<T: Real> Row<T> {
     /// The rate after the step of one joint alone, A = `a` and b = `impulse`.
     #[inline]
     pub fn proximal(&self, a: T, impulse: T, before: T) -> T {
-        let mut rate = soft_threshold(impulse, &self.friction) / a;
-        if rate.value() * before.value() < 0.0 {
-            let unturned = if before.value() > 0.0 {
-                (impulse - self.friction.against_plus) / a
-            } else {
-                (impulse + self.friction.against_minus) / a
-            };
-            rate -= share_before_turning(before, unturned) * (rate - unturned);
-        }
+        let against_plus = (impulse - self.friction.against_plus) / a;
+        let against_minus = (impulse + self.friction.against_minus) / a;
+        let rate = if before.value() > 0.0 {
+            rate_after_turning(before, against_plus, against_minus)
+        } else if before.value() < 0.0 {
+            -rate_after_turning(-before, -against_minus, -against_plus)
+        } else {
+            soft_threshold(impulse, &self.friction) / a
+        };
         match (self.least, self.greatest) {
             (Some(least), _) if rate.value() < least.rate.value() => least.rate,
             (_, Some(greatest)) if rate.value() > greatest.rate.value() => greatest.rate,
@@ -118,8 +118,23 @@ impl<T: Real> Row<T> {
     }
 }
 
+/// The rate of one joint after a step from `before` > 0 that would end at `unturned` under the
+/// friction of positive motion, at `turned` under that of negative motion: if it comes to rest on
+/// the way, it stays there or turns round, as the other forces have it.
+#[inline]
+fn rate_after_turning<T: Real>(before: T, unturned: T, turned: T) -> T {
+    if unturned.value() >= 0.0 {
+        unturned
+    } else if turned.value() < before.value() {
+        turned - share_before_turning(before, unturned) * (turned - unturned)
+    } else {
+        T::zero()
+    }
+}
+
 /// The share of a step before a joint comes to rest that would have gone from the rate `before` to
 /// `unturned`, of the other sign, had friction not changed direction.
+#[inline]
 fn share_before_turning<T: Real>(before: T, unturned: T) -> T {
     before / (before - unturned)
 }
@@ -253,7 +268,8 @@ fn go_towards<T: Real>(rows: &[Row<T>], target: &[T], scratch: &mut SolveScratch
     }
 }
 
-/// For joints that turn round: friction of either direction, each for its share of the step.
+/// For joints that turn round: friction of either direction, each for its share of the step. A
+/// joint that sticks at the end of a step that it began in motion may have turned round as well.
 fn share_friction_of_turning<T: Real>(
     a: &[T],
     b: &[T],
@@ -261,17 +277,35 @@ fn share_friction_of_turning<T: Real>(
     rates: &mut [T],
     scratch: &mut SolveScratch<T>,
 ) {
-    let turns = |regime: Regime, before: f64| match regime {
-        Regime::SlipsPlus => before < 0.0,
-        Regime::SlipsMinus => before > 0.0,
-        _ => false,
-    };
     let n = rows.len();
-    if !(0..n).any(|j| turns(scratch.regimes[j], scratch.before[j].value())) {
+    let arrives = |j: usize, scratch: &SolveScratch<T>| {
+        scratch.regimes[j] == Regime::Sticks && scratch.before[j].value() != 0.0
+    };
+    let turns = |j: usize, scratch: &SolveScratch<T>| {
+        scratch.before[j].value() != 0.0
+            && scratch.regimes[j] == Regime::turned_from(scratch.before[j].value())
+    };
+    let mut any_turns = (0..n).any(|j| turns(j, scratch));
+    if (0..n).any(|j| arrives(j, scratch)) {
+        for j in 0..n {
+            if arrives(j, scratch) {
+                scratch.regimes[j] = Regime::turned_from(scratch.before[j].value());
+                solve_regimes(a, b, rows, rates, scratch);
+                let before = scratch.before[j].value();
+                if (rates[j].value() - before) * before < 0.0 {
+                    any_turns = true;
+                } else {
+                    scratch.regimes[j] = Regime::Sticks;
+                }
+            }
+        }
+        solve_regimes(a, b, rows, rates, scratch);
+    }
+    if !any_turns {
         return;
     }
     for j in 0..n {
-        if turns(scratch.regimes[j], scratch.before[j].value()) {
+        if turns(j, scratch) {
             scratch.regimes[j] = scratch.regimes[j].reversed();
         }
     }
@@ -295,6 +329,17 @@ fn share_friction_of_turning<T: Real>(
 }
 
 impl Regime {
+    /// The slip opposed to a rate; sticking, for none.
+    fn turned_from(before: f64) -> Self {
+        if before > 0.0 {
+            Self::SlipsMinus
+        } else if before < 0.0 {
+            Self::SlipsPlus
+        } else {
+            Self::Sticks
+        }
+    }
+
     fn reversed(self) -> Self {
         match self {
             Self::SlipsPlus => Self::SlipsMinus,
