@@ -1,7 +1,9 @@
-//! Chains against MuJoCo: the fixture is written by `mujoco_peer/trajectories.py`.
+//! Chains against MuJoCo: within 1 mm or 1 mrad over 4 s, with steps up to 2 ms.
+//!
+//! The fixture is written by `mujoco_peer/trajectories.py`.
 //!
 //! With `BOM_PEER_PYTHON` set to a Python that has `mujoco_peer/requirements.txt`, the reference is
-//! simulated anew.
+//! simulated anew. With `BOM_PEER_TABLE` set to a path, the errors are written there.
 
 use std::fmt::Write;
 use std::path::Path;
@@ -111,9 +113,6 @@ fn worst_error(chain: &Chain, step_s: f64) -> f64 {
         (0..chain.positions.len()).map(|i| i as f64 * chain.output_period_s).collect();
     let start = State::at_rest(chain.bodies.len());
     let run = rollout(&tree, &start, &[track], &times, step_s).unwrap();
-    if std::env::var_os("DBG").is_some() && step_s < 6e-4 {
-        for (i, e) in chain.positions.iter().enumerate() { eprintln!("{} {:?} {:?}", times[i], e, e.iter().zip(run.positions(i)).map(|(a,b)| 1e3*(b-a)).collect::<Vec<_>>()); }
-    }
     let errors = chain.positions.iter().enumerate().flat_map(|(i, expected)| {
         run.positions(i).iter().zip(expected).map(|(q, expected)| (q - expected).abs())
     });
@@ -136,10 +135,10 @@ fn chains_move_as_in_mujoco() {
             write!(table, " {:.1} ms: {error:.3}", 1e3 * step_s).unwrap();
         }
         writeln!(table).unwrap();
-        failed |= errors[1].is_nan() || errors[1] >= 1.0;
+        failed |= errors[..3].iter().any(|error| error.is_nan() || *error >= 1.0);
+    }
+    if let Some(path) = std::env::var_os("BOM_PEER_TABLE") {
+        std::fs::write(path, &table).unwrap();
     }
     assert!(!failed, "{table}");
-    if std::env::var_os("BOM_PEER_TABLE").is_some() {
-        std::fs::write(std::env::temp_dir().join("bom_mujoco_errors.txt"), table).unwrap();
-    }
 }
