@@ -5,6 +5,8 @@
 //! With `BOM_PEER_PYTHON` set to a Python that has `mujoco_peer/requirements.txt`, the reference is
 //! simulated anew. With `BOM_PEER_TABLE` set to a path, the errors are written there.
 
+#![allow(clippy::unwrap_used, reason = "a test")]
+
 use std::fmt::Write;
 use std::path::Path;
 use std::process::Command;
