@@ -15,6 +15,12 @@
 //! the wall: `math`, `types`, `geometry`, `registration`, `mechanism`, `structure`, `inference`,
 //! `model`, `pipeline`, `io`, `report`.
 
+pub mod geometry;
+pub mod io;
 pub mod math;
 pub mod mechanism;
+pub mod model;
+pub mod pipeline;
+pub mod registration;
+pub mod structure;
 pub mod types;

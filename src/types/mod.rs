@@ -104,3 +104,25 @@ pub struct MeasuredPose {
     /// covariance is infinite (a position without orientation).
     pub information: Matrix6<f64>,
 }
+
+/// One message of the stream after reading: decoded, in world, in SI units.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Input {
+    /// What one camera saw.
+    Cloud(SegmentedCloud),
+    /// What a tool did.
+    Wrench(AppliedWrench),
+    /// Where a part was measured to be.
+    Pose(Box<MeasuredPose>),
+}
+
+impl Input {
+    /// When it was captured or measured, by the stream's own clock.
+    pub fn stamp(&self) -> Stamp {
+        match self {
+            Input::Cloud(cloud) => cloud.stamp,
+            Input::Wrench(wrench) => wrench.stamp,
+            Input::Pose(pose) => pose.stamp,
+        }
+    }
+}

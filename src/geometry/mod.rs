@@ -1,0 +1,5 @@
+//! Shapes of parts: convex hulls and their mass properties. The only layer that knows parry.
+
+mod hull;
+
+pub use hull::{HullProperties, hull_properties};

@@ -1,0 +1,235 @@
+//! The evidence for every (parent, type) of a part: one joint fitted to the part's motion relative
+//! to the parent's.
+//!
+//! Relative displacements D_i⁻¹ D_j must lie on {exp(S q)}. With the parent's track given, the
+//! evidence splits by edge: −(robust cost) − (moves) + (Laplace volume of the axis against its prior).
+//! A move is a change of joint position from one frame to the next: joints rest unless driven, so a
+//! hypothesis that needs one joint to undo another's motion pays for every frame of it.
+
+use std::collections::BTreeMap;
+
+use nalgebra::Vector3;
+
+use super::kinematics::{AXIS_POINT_PRIOR, Axis, KinematicJoint, KinematicSettings, fit_kinematics};
+use super::window::{Contact, PoseMeasurement, WindowObservations};
+use crate::math::{Pose, Screw, orthonormal_pair};
+use crate::mechanism::JointType;
+use crate::types::Label;
+
+/// Cost of one move \[nats\].
+pub const MOVE_COST: f64 = 3.0;
+/// Standard deviation of a direction's prior \[rad\].
+const AXIS_DIRECTION_PRIOR: f64 = 1.0;
+/// Frames of one scene are not independent looks: their evidence is raised to this power.
+const TEMPERATURE: f64 = 0.5;
+
+/// A part as edges see it.
+#[derive(Clone, Copy, Debug)]
+pub struct EdgePart {
+    /// Its label.
+    pub label: Label,
+    /// Reference point \[m\].
+    pub center: Vector3<f64>,
+    /// Length that scales rotations \[m\].
+    pub radius: f64,
+}
+
+/// One joint type of one edge.
+#[derive(Clone, Debug)]
+pub struct EdgeFit {
+    /// Log evidence, tempered \[nats\].
+    pub log_evidence: f64,
+    /// The fitted joint (its `parent` is `None`: relative to the parent's track).
+    pub joint: KinematicJoint,
+    /// Joint positions by window and frame.
+    pub positions: Vec<Vec<f64>>,
+}
+
+/// The windows seen from a parent that moves along `track` (by window and frame).
+pub fn relative_windows(child: Label, track: Option<&[Vec<Pose>]>, windows: &[&WindowObservations]) -> Vec<WindowObservations> {
+    windows
+        .iter()
+        .enumerate()
+        .map(|(w, window)| {
+            let reference = |k: usize| track.map_or_else(Pose::identity, |t| t[w][k].inverse());
+            let poses = window.poses.get(&child).map(|poses| {
+                poses
+                    .iter()
+                    .enumerate()
+                    .map(|(k, m)| m.map(|m| PoseMeasurement { displacement: reference(k) * m.displacement, ..m }))
+                    .collect()
+            });
+            WindowObservations {
+                times_s: window.times_s.clone(),
+                poses: poses.map(|p| BTreeMap::from([(child, p)])).unwrap_or_default(),
+                contacts: window
+                    .contacts
+                    .iter()
+                    .filter(|c| c.label == child)
+                    .map(|c| Contact {
+                        label: child,
+                        track: c.track.iter().map(|(k, x, s)| (*k, reference(*k).transform_point(x), *s)).collect(),
+                    })
+                    .collect(),
+                wrenches: Vec::new(),
+            }
+        })
+        .collect()
+}
+
+/// Evidence of no motion at all relative to the parent.
+pub fn rigid_evidence(part: &EdgePart, windows: &[WindowObservations], settings: &KinematicSettings) -> f64 {
+    let still = KinematicJoint {
+        parent: None,
+        child: part.label,
+        joint_type: JointType::Rigid,
+        axis: Axis { direction: Vector3::z(), point: part.center },
+        center: part.center,
+        radius: part.radius,
+    };
+    let references: Vec<&WindowObservations> = windows.iter().collect();
+    let positions = windows.iter().map(|w| vec![vec![0.0; w.times_s.len()]]).collect();
+    let frozen = KinematicSettings { steps: 2, ..*settings };
+    -TEMPERATURE * fit_kinematics(vec![still], positions, &references, &frozen).cost
+}
+
+/// Fits one moving type from each start axis and keeps the best.
+pub fn moving_evidence(
+    part: &EdgePart,
+    joint_type: JointType,
+    starts: &[Axis],
+    windows: &[WindowObservations],
+    settings: &KinematicSettings,
+) -> Option<EdgeFit> {
+    let references: Vec<&WindowObservations> = windows.iter().collect();
+    starts
+        .iter()
+        .map(|axis| {
+            let along = axis.direction.dot(&(part.center - axis.point));
+            let joint = KinematicJoint {
+                parent: None,
+                child: part.label,
+                joint_type,
+                axis: Axis { direction: axis.direction, point: axis.point + axis.direction * along },
+                center: part.center,
+                radius: part.radius,
+            };
+            let positions = windows.iter().map(|w| vec![start_positions(&joint, w)]).collect();
+            let fit = fit_kinematics(vec![joint], positions, &references, settings);
+            let parameters = joint.axis_parameters();
+            let priors = [AXIS_DIRECTION_PRIOR, AXIS_DIRECTION_PRIOR, AXIS_POINT_PRIOR, AXIS_POINT_PRIOR];
+            let volume: f64 = (0..parameters)
+                .map(|i| 0.5 * fit.covariance[(i, i)].max(1e-16).ln() - priors[i].ln())
+                .map(|x: f64| x.min(0.0))
+                .sum();
+            let log_evidence = -TEMPERATURE * fit.cost - MOVE_COST * TEMPERATURE * fit.moves[0] as f64 + volume;
+            EdgeFit {
+                log_evidence,
+                joint: fit.joints[0],
+                positions: fit.positions.into_iter().map(|mut w| w.swap_remove(0)).collect(),
+            }
+        })
+        .filter(|fit| fit.log_evidence.is_finite())
+        .max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence))
+}
+
+/// Start axes from the motion itself: the relative displacement between the two frames furthest apart.
+pub fn axes_from_motion(part: &EdgePart, joint_type: JointType, windows: &[WindowObservations]) -> Vec<Axis> {
+    let place = |d: &Pose| (d.transform_point(&part.center), d.rotation);
+    let mut best: Option<(f64, Pose, Pose)> = None;
+    for window in windows {
+        let measured: Vec<Pose> = window.poses.get(&part.label).into_iter().flatten().flatten().map(|m| m.displacement).collect();
+        for first in measured.iter().step_by((measured.len() / 6).max(1)) {
+            for second in &measured {
+                let ((p, r), (q, s)) = (place(first), place(second));
+                let apart = (p - q).norm() + part.radius * (r - s).norm();
+                if best.as_ref().is_none_or(|(b, _, _)| apart > *b) {
+                    best = Some((apart, *first, *second));
+                }
+            }
+        }
+    }
+    let Some((_, first, second)) = best else { return Vec::new() };
+    let shift = second.transform_point(&part.center) - first.transform_point(&part.center);
+    match joint_type {
+        JointType::Prismatic => shift.try_normalize(1e-6).map(|direction| Axis { direction, point: part.center }).into_iter().collect(),
+        JointType::Revolute => {
+            // Screw of the motion between the two frames, in the parent's frame at reference.
+            let twist = (second * first.inverse()).log();
+            let angular: Vector3<f64> = twist.fixed_rows::<3>(0).into();
+            let linear: Vector3<f64> = twist.fixed_rows::<3>(3).into();
+            let angle = angular.norm();
+            if angle < 0.02 {
+                return far_axes(&shift, &part.center);
+            }
+            let direction = angular / angle;
+            vec![Axis { direction, point: direction.cross(&linear) / angle }]
+        }
+        JointType::Rigid => Vec::new(),
+    }
+}
+
+/// Far axes that turn a nearly straight motion.
+fn far_axes(shift: &Vector3<f64>, center: &Vector3<f64>) -> Vec<Axis> {
+    let Some(along) = shift.try_normalize(1e-6) else { return Vec::new() };
+    let (first, second) = orthonormal_pair(&along);
+    [(first, second), (first, -second), (second, first), (second, -first)]
+        .into_iter()
+        .map(|(direction, away)| Axis { direction, point: center + away })
+        .collect()
+}
+
+/// Joint positions nearest the measured poses: Gauss–Newton on each frame alone.
+fn start_positions(joint: &KinematicJoint, window: &WindowObservations) -> Vec<f64> {
+    let screw = joint.screw();
+    let mut last = 0.0;
+    let poses = window.poses.get(&joint.child);
+    (0..window.times_s.len())
+        .map(|k| {
+            if let Some(m) = poses.and_then(|p| p[k]) {
+                last = nearest_position(joint, &screw, &m, last);
+            }
+            last
+        })
+        .collect()
+}
+
+fn nearest_position(joint: &KinematicJoint, screw: &Screw, measured: &PoseMeasurement, start: f64) -> f64 {
+    let residual = |q: f64| {
+        (Pose::from_translation(-joint.center)
+            * measured.displacement.inverse()
+            * screw.displacement(q)
+            * Pose::from_translation(joint.center))
+        .log()
+    };
+    let guesses = match joint.joint_type {
+        JointType::Revolute => {
+            let rotation = measured.displacement.quaternion();
+            let turn = 2.0 * rotation.imag().dot(&joint.axis.direction).atan2(rotation.w);
+            [start, (turn + std::f64::consts::PI).rem_euclid(std::f64::consts::TAU) - std::f64::consts::PI]
+        }
+        _ => {
+            let shift = measured.displacement.transform_point(&joint.center) - joint.center;
+            [start, shift.dot(&joint.axis.direction)]
+        }
+    };
+    let mut best = (f64::INFINITY, start);
+    for mut q in guesses {
+        for _ in 0..4 {
+            let h = 1e-5;
+            let slope = (residual(q + h) - residual(q - h)) / (2.0 * h);
+            let weighted = measured.information * slope;
+            let curvature = weighted.dot(&slope);
+            if curvature < 1e-6 {
+                break;
+            }
+            q -= (weighted.dot(&residual(q)) / curvature).clamp(-0.3, 0.3);
+        }
+        let r = residual(q);
+        let cost = r.dot(&(measured.information * r));
+        if cost < best.0 {
+            best = (cost, q);
+        }
+    }
+    best.1
+}

@@ -1,0 +1,664 @@
+//! Screw axes, joint positions, contact points and the tool's offset, jointly, from measured poses.
+//!
+//! For part j with parent i: D_j = D_i · exp(S_j q_j). A pose measurement contributes
+//! r = log(T(−c) D_obs⁻¹ D_j T(c)) with its information; a contact contributes x − o − D_j p with the
+//! contact point p free per contact and the tool's offset o shared by all. Moving the axis by a
+//! small rigid motion δ moves exp(S q) by the left twist (I − Ad(exp(S q))) δ.
+//!
+//! Gauss–Newton with Student-t weights; each window's joint positions and contact points are
+//! eliminated, so the cost is linear in the number of windows.
+
+use std::collections::BTreeMap;
+use std::rc::Rc;
+
+use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
+
+use super::window::{Contact, WindowObservations};
+use crate::math::{Pose, Screw, orthonormal_pair};
+use crate::mechanism::JointType;
+use crate::types::Label;
+
+/// Standard deviation of a hinge's distance from its part's reference point, per direction \[m\]:
+/// furniture-sized parts turn about axes within a metre or so.
+pub const AXIS_POINT_PRIOR: f64 = 0.5;
+
+/// A joint axis in world at the reference configuration.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Axis {
+    /// Unit direction.
+    pub direction: Vector3<f64>,
+    /// The point of the axis nearest the child's reference point \[m\].
+    pub point: Vector3<f64>,
+}
+
+/// One joint of a hypothesis.
+#[derive(Clone, Copy, Debug)]
+pub struct KinematicJoint {
+    /// Index of the parent's joint in the list, `None` where the parent never moves.
+    pub parent: Option<usize>,
+    /// The part it carries.
+    pub child: Label,
+    /// Prismatic or revolute.
+    pub joint_type: JointType,
+    /// Start value of the axis.
+    pub axis: Axis,
+    /// The child's reference point: poses are compared and rotations taken about it \[m\].
+    pub center: Vector3<f64>,
+    /// Length that makes rotations of the child comparable with translations \[m\].
+    pub radius: f64,
+}
+
+impl KinematicJoint {
+    /// The screw of the joint's axis.
+    pub fn screw(&self) -> Screw {
+        match self.joint_type {
+            JointType::Rigid => Screw::rigid(),
+            JointType::Prismatic => Screw::prismatic(&self.axis.direction),
+            JointType::Revolute => Screw::revolute(&self.axis.direction, &self.axis.point),
+        }
+    }
+
+    /// How many numbers its axis has.
+    pub fn axis_parameters(&self) -> usize {
+        match self.joint_type {
+            JointType::Rigid => 0,
+            JointType::Prismatic => 2,
+            JointType::Revolute => 4,
+        }
+    }
+
+    /// The axis's tangent twists: two rotations about its point, then two translations across it.
+    fn axis_basis(&self) -> [Vector6<f64>; 4] {
+        let (first, second) = orthonormal_pair(&self.axis.direction);
+        [
+            Screw::revolute(&first, &self.axis.point).0,
+            Screw::revolute(&second, &self.axis.point).0,
+            Screw::prismatic(&first).0,
+            Screw::prismatic(&second).0,
+        ]
+    }
+
+    /// Moves the axis along its tangent.
+    fn retract(&mut self, step: &[f64]) {
+        let (first, second) = orthonormal_pair(&self.axis.direction);
+        let at = |i: usize| step.get(i).copied().unwrap_or(0.0);
+        // A rotation by ω turns n into n + ω × n.
+        let turn = first * at(0) + second * at(1);
+        let direction = (self.axis.direction + turn.cross(&self.axis.direction)).normalize();
+        let point = self.axis.point + first * at(2) + second * at(3);
+        let along = direction.dot(&(self.center - point));
+        self.axis = Axis { direction, point: point + direction * along };
+    }
+}
+
+/// What is assumed of the measurements.
+#[derive(Clone, Copy, Debug)]
+pub struct KinematicSettings {
+    /// Standard deviation of the tool's constant offset, per axis \[m\].
+    pub tool_offset_sigma: f64,
+    /// Registration error that frames at the same pose share \[m\].
+    pub shared_error: f64,
+    /// Frames within this distance share their registration error \[m\].
+    pub shared_distance: f64,
+    /// Joint positions closer than this many standard deviations are one rest.
+    pub rest_deviations: f64,
+    /// Gauss–Newton steps at most.
+    pub steps: usize,
+    /// Degrees of freedom of the Student-t weights on whole pose measurements.
+    pub student_freedom: f64,
+}
+
+impl Default for KinematicSettings {
+    fn default() -> Self {
+        Self {
+            tool_offset_sigma: 0.003,
+            shared_error: 0.0015,
+            shared_distance: 0.010,
+            rest_deviations: 2.0,
+            steps: 15,
+            student_freedom: 6.0,
+        }
+    }
+}
+
+/// The fitted kinematics.
+#[derive(Clone, Debug)]
+pub struct KinematicFit {
+    /// The joints with their fitted axes.
+    pub joints: Vec<KinematicJoint>,
+    /// Joint positions by window, joint, frame.
+    pub positions: Vec<Vec<Vec<f64>>>,
+    /// Contact points at the reference configuration by window and contact \[m\].
+    pub contact_points: Vec<Vec<Vector3<f64>>>,
+    /// The tool's offset in world \[m\].
+    pub tool_offset: Vector3<f64>,
+    /// Covariance of all axis parameters, joint by joint, then the tool's offset.
+    pub covariance: DMatrix<f64>,
+    /// Negative log density at the solution, up to constants of the data.
+    pub cost: f64,
+    /// Joint positions that moved from one frame to the next, by joint.
+    pub moves: Vec<usize>,
+    /// Whether the last step was small.
+    pub converged: bool,
+}
+
+impl KinematicFit {
+    /// Displacement of every joint's child in a frame.
+    pub fn displacements(&self, window: usize, frame: usize) -> Vec<Pose> {
+        forward(&self.joints, |joint| self.positions[window][joint][frame])
+    }
+
+    /// First row of a joint's axis in the covariance.
+    pub fn axis_offset(&self, joint: usize) -> usize {
+        self.joints[..joint].iter().map(KinematicJoint::axis_parameters).sum()
+    }
+}
+
+/// Displacements of all children, parents first in the list.
+fn forward(joints: &[KinematicJoint], position: impl Fn(usize) -> f64) -> Vec<Pose> {
+    let mut displacements: Vec<Pose> = Vec::with_capacity(joints.len());
+    for (index, joint) in joints.iter().enumerate() {
+        let parent = joint.parent.map_or_else(Pose::identity, |p| displacements[p]);
+        displacements.push(parent * joint.screw().displacement(position(index)));
+    }
+    displacements
+}
+
+/// Fits axes and joint positions to the windows, from the joints' start axes and start positions
+/// (by window, joint, frame). Parents come before their children in `joints`.
+pub fn fit_kinematics(
+    joints: Vec<KinematicJoint>,
+    positions: Vec<Vec<Vec<f64>>>,
+    windows: &[&WindowObservations],
+    settings: &KinematicSettings,
+) -> KinematicFit {
+    let mut problem = Problem::new(joints, positions, windows, settings);
+    let mut cost = problem.cost();
+    let mut damping = 1e-6;
+    let mut converged = false;
+    let mut tied = false;
+    for step in 0..settings.steps {
+        if step == settings.steps / 2 || (converged && !tied) {
+            problem.share_errors();
+            problem.tie_rests();
+            tied = true;
+            converged = false;
+            cost = problem.cost();
+        }
+        let systems = problem.linearize();
+        let mut accepted = false;
+        for _ in 0..6 {
+            let trial = problem.stepped(&systems, damping);
+            let trial_cost = trial.cost();
+            if trial_cost.is_finite() && trial_cost <= cost + 1e-9 {
+                converged = cost - trial_cost < 1e-6 * (1.0 + cost.abs());
+                problem = trial;
+                cost = trial_cost;
+                damping = (damping * 0.2_f64).max(1e-9);
+                accepted = true;
+                break;
+            }
+            damping *= 20.0;
+        }
+        if !accepted {
+            converged = true;
+        }
+        if converged && tied {
+            break;
+        }
+    }
+    problem.finish(cost, converged)
+}
+
+/// One window's normal equations with its local unknowns still in.
+struct WindowSystem {
+    local: DMatrix<f64>,
+    local_gradient: DVector<f64>,
+    coupling: DMatrix<f64>,
+    global: DMatrix<f64>,
+    global_gradient: DVector<f64>,
+}
+
+#[derive(Clone)]
+struct Problem<'a> {
+    joints: Vec<KinematicJoint>,
+    windows: &'a [&'a WindowObservations],
+    settings: &'a KinematicSettings,
+    positions: Vec<Vec<Vec<f64>>>,
+    /// By window, joint, frame: which local unknown its position is.
+    slots: Vec<Vec<Vec<usize>>>,
+    /// By window: how many local position unknowns.
+    slot_counts: Vec<usize>,
+    /// By window, joint, frame: information after the error that frames at one pose share.
+    information: Rc<Vec<Vec<Vec<Option<Matrix6<f64>>>>>>,
+    contact_points: Vec<Vec<Vector3<f64>>>,
+    tool_offset: Vector3<f64>,
+    by_label: BTreeMap<Label, usize>,
+}
+
+impl<'a> Problem<'a> {
+    fn new(
+        joints: Vec<KinematicJoint>,
+        positions: Vec<Vec<Vec<f64>>>,
+        windows: &'a [&'a WindowObservations],
+        settings: &'a KinematicSettings,
+    ) -> Self {
+        let by_label = joints.iter().enumerate().map(|(i, j)| (j.child, i)).collect();
+        let mut problem = Self {
+            joints,
+            windows,
+            settings,
+            positions,
+            slots: Vec::new(),
+            slot_counts: Vec::new(),
+            information: Rc::default(),
+            contact_points: Vec::new(),
+            tool_offset: Vector3::zeros(),
+            by_label,
+        };
+        problem.separate_frames();
+        problem.information = Rc::new(problem.informations(|_, _, _| 1.0));
+        problem.contact_points = (0..windows.len()).map(|w| problem.initial_contact_points(w)).collect();
+        problem
+    }
+
+    /// Every frame its own unknown.
+    fn separate_frames(&mut self) {
+        let joints = self.joints.len();
+        self.slots = self
+            .windows
+            .iter()
+            .map(|w| (0..joints).map(|j| (0..w.times_s.len()).map(|k| j * w.times_s.len() + k).collect()).collect())
+            .collect();
+        self.slot_counts = self.windows.iter().map(|w| joints * w.times_s.len()).collect();
+    }
+
+    fn initial_contact_points(&self, window: usize) -> Vec<Vector3<f64>> {
+        self.windows[window]
+            .contacts
+            .iter()
+            .map(|contact| {
+                let mut sum = Vector3::zeros();
+                for (frame, x, _) in &contact.track {
+                    let displacements = forward(&self.joints, |j| self.positions[window][j][*frame]);
+                    let pose = self.by_label.get(&contact.label).map_or_else(Pose::identity, |&j| displacements[j]);
+                    sum += pose.inverse().transform_point(&(x - self.tool_offset));
+                }
+                sum / contact.track.len().max(1) as f64
+            })
+            .collect()
+    }
+
+    /// Information of every measurement, given how many frames share its registration error.
+    fn informations(&self, sharing: impl Fn(usize, usize, usize) -> f64) -> Vec<Vec<Vec<Option<Matrix6<f64>>>>> {
+        let one = |w: usize, j: usize, frame: usize| {
+            let joint = &self.joints[j];
+            let raw = self.windows[w].poses.get(&joint.child)?[frame]?.information;
+            let scale = Vector6::new(joint.radius, joint.radius, joint.radius, 1.0, 1.0, 1.0);
+            let scaled = Matrix6::from_fn(|i, j| raw[(i, j)] / (scale[i] * scale[j]));
+            let mut eigen = scaled.symmetric_eigen();
+            let shared = sharing(w, j, frame) * self.settings.shared_error.powi(2);
+            eigen.eigenvalues.apply(|x| *x = if *x > 0.0 { 1.0 / (1.0 / *x + shared) } else { 0.0 });
+            let clean = eigen.recompose();
+            Some(Matrix6::from_fn(|i, j| clean[(i, j)] * scale[i] * scale[j]))
+        };
+        (0..self.windows.len())
+            .map(|w| {
+                let frames = self.windows[w].times_s.len();
+                (0..self.joints.len()).map(|j| (0..frames).map(|k| one(w, j, k)).collect()).collect()
+            })
+            .collect()
+    }
+
+    fn measurement(&self, w: usize, j: usize, frame: usize) -> Option<(&Pose, Matrix6<f64>)> {
+        let information = self.information[w][j][frame]?;
+        let measured = self.windows[w].poses.get(&self.joints[j].child)?[frame].as_ref()?;
+        Some((&measured.displacement, information))
+    }
+
+    fn student_cost(&self, chi_squared: f64, dimensions: f64) -> f64 {
+        let freedom = self.settings.student_freedom;
+        0.5 * (freedom + dimensions) * (chi_squared / freedom).ln_1p()
+    }
+
+    fn student_weight(&self, chi_squared: f64, dimensions: f64) -> f64 {
+        let freedom = self.settings.student_freedom;
+        (freedom + dimensions) / (freedom + chi_squared)
+    }
+
+    fn cost(&self) -> f64 {
+        let mut cost = 0.5 * self.tool_offset.norm_squared() / self.settings.tool_offset_sigma.powi(2);
+        for joint in self.joints.iter().filter(|j| j.joint_type == JointType::Revolute) {
+            cost += 0.5 * (joint.axis.point - joint.center).norm_squared() / AXIS_POINT_PRIOR.powi(2);
+        }
+        for (w, window) in self.windows.iter().enumerate() {
+            for frame in 0..window.times_s.len() {
+                let displacements = forward(&self.joints, |j| self.positions[w][j][frame]);
+                for (j, joint) in self.joints.iter().enumerate() {
+                    let Some((measured, information)) = self.measurement(w, j, frame) else { continue };
+                    let r = pose_residual(joint, measured, &displacements[j]);
+                    let chi_squared = r.dot(&(information * r));
+                    cost += self.student_cost(chi_squared, 6.0);
+                }
+            }
+            for (c, contact) in window.contacts.iter().enumerate() {
+                let Some(&j) = self.by_label.get(&contact.label) else { continue };
+                for (frame, x, sigma) in &contact.track {
+                    let displacements = forward(&self.joints, |i| self.positions[w][i][*frame]);
+                    let e = self.contact_residual(&displacements[j], x, w, c);
+                    cost += self.student_cost(e.norm_squared() / (sigma * sigma), 3.0);
+                }
+            }
+        }
+        cost
+    }
+
+    fn contact_residual(&self, displacement: &Pose, x: &Vector3<f64>, window: usize, contact: usize) -> Vector3<f64> {
+        x - self.tool_offset - displacement.transform_point(&self.contact_points[window][contact])
+    }
+
+    fn global_count(&self) -> usize {
+        self.joints.iter().map(KinematicJoint::axis_parameters).sum::<usize>() + 3
+    }
+
+    fn linearize(&self) -> Vec<WindowSystem> {
+        (0..self.windows.len()).map(|w| self.linearize_window(w)).collect()
+    }
+
+    fn linearize_window(&self, w: usize) -> WindowSystem {
+        let window = self.windows[w];
+        let globals = self.global_count();
+        let locals = self.slot_counts[w] + 3 * window.contacts.len();
+        let mut system = WindowSystem {
+            local: DMatrix::identity(locals, locals) * 1e-2,
+            local_gradient: DVector::zeros(locals),
+            coupling: DMatrix::zeros(locals, globals),
+            global: DMatrix::zeros(globals, globals),
+            global_gradient: DVector::zeros(globals),
+        };
+        let mut touching: Vec<Vec<(usize, Vector3<f64>, f64)>> = vec![Vec::new(); window.times_s.len()];
+        for (c, contact) in window.contacts.iter().enumerate() {
+            for (frame, x, sigma) in &contact.track {
+                touching[*frame].push((c, *x, *sigma));
+            }
+        }
+        for (frame, touches) in touching.iter().enumerate() {
+            let displacements = forward(&self.joints, |j| self.positions[w][j][frame]);
+            let columns = self.twist_columns(w, frame, &displacements);
+            for (j, joint) in self.joints.iter().enumerate() {
+                let Some((measured, information)) = self.measurement(w, j, frame) else { continue };
+                let r = pose_residual(joint, measured, &displacements[j]);
+                let weight = self.student_weight(r.dot(&(information * r)), 6.0);
+                let into_body = (Pose::from_translation(-joint.center) * displacements[j].inverse()).adjoint_matrix();
+                let jacobian: Vec<_> = columns[j].iter().map(|(at, v)| (*at, into_body * v)).collect();
+                accumulate(&mut system, &jacobian, &(information * weight), &r);
+            }
+            for (c, x, sigma) in touches {
+                let Some(&j) = self.by_label.get(&window.contacts[*c].label) else { continue };
+                let e = self.contact_residual(&displacements[j], x, w, *c);
+                let weight = self.student_weight(e.norm_squared() / (sigma * sigma), 3.0) / (sigma * sigma);
+                let moved = displacements[j].transform_point(&self.contact_points[w][*c]);
+                let mut jacobian: Vec<(Slot, Vector3<f64>)> = columns[j]
+                    .iter()
+                    .map(|(at, v)| {
+                        let angular: Vector3<f64> = v.fixed_rows::<3>(0).into();
+                        let linear: Vector3<f64> = v.fixed_rows::<3>(3).into();
+                        (*at, -(angular.cross(&moved) + linear))
+                    })
+                    .collect();
+                for axis in 0..3 {
+                    let column: Vector3<f64> = displacements[j].rotation.column(axis).into();
+                    jacobian.push((Slot::Local(self.slot_counts[w] + 3 * c + axis), -column));
+                    jacobian.push((Slot::Global(globals - 3 + axis), -Matrix3::identity().column(axis)));
+                }
+                accumulate(&mut system, &jacobian, &(Matrix3::identity() * weight), &e);
+            }
+        }
+        system
+    }
+
+    /// For each joint's child, the unknowns that move it and the left twists they move it by.
+    fn twist_columns(&self, w: usize, frame: usize, displacements: &[Pose]) -> Vec<Vec<(Slot, Vector6<f64>)>> {
+        let mut columns: Vec<Vec<(Slot, Vector6<f64>)>> = Vec::with_capacity(self.joints.len());
+        let mut offset = 0;
+        for (j, joint) in self.joints.iter().enumerate() {
+            let mut own = joint.parent.map_or_else(Vec::new, |p| columns[p].clone());
+            let parent = joint.parent.map_or_else(Pose::identity, |p| displacements[p]);
+            let screw = joint.screw();
+            own.push((Slot::Local(self.slots[w][j][frame]), parent.adjoint(&screw.0)));
+            let motion = screw.displacement(self.positions[w][j][frame]);
+            for (index, basis) in joint.axis_basis().iter().take(joint.axis_parameters()).enumerate() {
+                own.push((Slot::Global(offset + index), parent.adjoint(&(basis - motion.adjoint(basis)))));
+            }
+            offset += joint.axis_parameters();
+            columns.push(own);
+        }
+        columns
+    }
+
+    /// The reduced system in the global unknowns: Σ (global − couplingᵀ local⁻¹ coupling) plus priors.
+    fn reduced(&self, systems: &[WindowSystem], damping: f64) -> (DMatrix<f64>, DVector<f64>, Vec<Option<LocalSolve>>) {
+        let globals = self.global_count();
+        let mut matrix = DMatrix::zeros(globals, globals);
+        let mut gradient = DVector::zeros(globals);
+        let mut at = 0;
+        for joint in &self.joints {
+            let arm = joint.axis.point - joint.center;
+            let (first, second) = orthonormal_pair(&joint.axis.direction);
+            for (i, pull) in [0.0, 0.0, arm.dot(&first), arm.dot(&second)].into_iter().take(joint.axis_parameters()).enumerate() {
+                let information = if i < 2 { 1.0 } else { AXIS_POINT_PRIOR.powi(-2) };
+                matrix[(at + i, at + i)] += information;
+                gradient[at + i] += information * pull;
+            }
+            at += joint.axis_parameters();
+        }
+        let offset_information = 1.0 / self.settings.tool_offset_sigma.powi(2);
+        for i in 0..3 {
+            matrix[(globals - 3 + i, globals - 3 + i)] += offset_information;
+            gradient[globals - 3 + i] += offset_information * self.tool_offset[i];
+        }
+        let mut solves = Vec::with_capacity(systems.len());
+        for system in systems {
+            matrix += &system.global;
+            gradient += &system.global_gradient;
+            let mut local = system.local.clone();
+            for i in 0..local.nrows() {
+                local[(i, i)] *= 1.0 + damping;
+            }
+            let solve = local.cholesky().map(|cholesky| LocalSolve {
+                coupling: cholesky.solve(&system.coupling),
+                gradient: cholesky.solve(&system.local_gradient),
+            });
+            if let Some(solve) = &solve {
+                matrix -= system.coupling.transpose() * &solve.coupling;
+                gradient -= system.coupling.transpose() * &solve.gradient;
+            }
+            solves.push(solve);
+        }
+        (matrix, gradient, solves)
+    }
+
+    fn stepped(&self, systems: &[WindowSystem], damping: f64) -> Self {
+        let (mut matrix, gradient, solves) = self.reduced(systems, damping);
+        for i in 0..matrix.nrows() {
+            matrix[(i, i)] *= 1.0 + damping;
+        }
+        let mut next = self.clone();
+        let Some(cholesky) = matrix.cholesky() else { return next };
+        let global_step = -cholesky.solve(&gradient);
+        let mut offset = 0;
+        for joint in &mut next.joints {
+            let count = joint.axis_parameters();
+            joint.retract(&global_step.as_slice()[offset..offset + count]);
+            offset += count;
+        }
+        next.tool_offset += global_step.fixed_rows::<3>(offset);
+        for (w, solve) in solves.iter().enumerate() {
+            let Some(solve) = solve else { continue };
+            let step = -(&solve.gradient + &solve.coupling * &global_step);
+            for j in 0..self.joints.len() {
+                for (frame, position) in next.positions[w][j].iter_mut().enumerate() {
+                    *position += step[self.slots[w][j][frame]];
+                }
+            }
+            for (c, point) in next.contact_points[w].iter_mut().enumerate() {
+                *point += step.fixed_rows::<3>(self.slot_counts[w] + 3 * c);
+            }
+        }
+        next
+    }
+
+    /// Counts, for every frame, the frames of its part within `shared_distance` of it.
+    fn share_errors(&mut self) {
+        let mut sharing: BTreeMap<(usize, usize, usize), f64> = BTreeMap::new();
+        for j in 0..self.joints.len() {
+            let mut places = Vec::new();
+            for (w, window) in self.windows.iter().enumerate() {
+                for frame in 0..window.times_s.len() {
+                    let displacement = forward(&self.joints, |i| self.positions[w][i][frame])[j];
+                    let rotated = displacement.rotation * Vector3::repeat(self.joints[j].radius / 3f64.sqrt());
+                    places.push((w, frame, displacement.transform_point(&self.joints[j].center), rotated));
+                }
+            }
+            for (w, frame, place, rotated) in &places {
+                let near = places
+                    .iter()
+                    .filter(|(_, _, p, r)| (p - place).norm() + (r - rotated).norm() < self.settings.shared_distance)
+                    .count();
+                sharing.insert((*w, j, *frame), near as f64);
+            }
+        }
+        self.information = Rc::new(self.informations(|w, j, frame| sharing.get(&(w, j, frame)).copied().unwrap_or(1.0)));
+    }
+
+    /// Makes frames in which a joint rests one unknown: friction holds what is not pushed.
+    fn tie_rests(&mut self) {
+        let systems = self.linearize();
+        for (w, window) in self.windows.iter().enumerate() {
+            let deviations = systems[w].local.clone().cholesky().map(|c| c.inverse().diagonal());
+            let mut next_slot = 0;
+            for j in 0..self.joints.len() {
+                let sigma = |frame: usize| {
+                    deviations.as_ref().map_or(0.0, |d| d[self.slots[w][j][frame]].max(0.0).sqrt())
+                };
+                let runs = rest_runs(&self.positions[w][j], sigma, self.settings.rest_deviations);
+                for run in runs {
+                    let mean = run.clone().map(|k| self.positions[w][j][k]).sum::<f64>() / run.len() as f64;
+                    for k in run {
+                        self.positions[w][j][k] = mean;
+                        self.slots[w][j][k] = next_slot;
+                    }
+                    next_slot += 1;
+                }
+            }
+            debug_assert!(next_slot <= self.joints.len() * window.times_s.len());
+            self.slot_counts[w] = next_slot;
+        }
+    }
+
+    fn finish(self, cost: f64, converged: bool) -> KinematicFit {
+        if std::env::var("DUMP").is_ok() && self.windows.len() > 1 {
+            for (w, window) in self.windows.iter().enumerate() {
+                for frame in 0..window.times_s.len() {
+                    let displacements = forward(&self.joints, |j| self.positions[w][j][frame]);
+                    for (j, joint) in self.joints.iter().enumerate() {
+                        let Some((measured, information)) = self.measurement(w, j, frame) else { continue };
+                        let r = pose_residual(joint, measured, &displacements[j]);
+                        let raw = self.windows[w].poses[&joint.child][frame].unwrap().information;
+                        let tool = window.contacts.iter().enumerate().find(|(_, c)| c.label == joint.child).and_then(|(c, k)| k.track.iter().find(|t| t.0 == frame).map(|t| { let e = self.contact_residual(&displacements[j], &t.1, w, c); (1e3 * e, t.2 * 1e3) }));
+                        eprintln!("DUMP {w} {} j{} q {:.4} chi {:.1} raw {:.1} rot {:.2?} mm {:.2?} sd {:.2?} tool {:?}", window.times_s[frame], joint.child, self.positions[w][j][frame], r.dot(&(information * r)), r.dot(&(raw * r)), (r * 57.3).fixed_rows::<3>(0).as_slice(), (r * 1e3).fixed_rows::<3>(3).as_slice(), (0..6).map(|i| if i < 3 {57.3} else {1e3} / raw[(i,i)].sqrt()).collect::<Vec<_>>(), tool.map(|t| (format!("{:.2?}", t.0.as_slice()), t.1)));
+                    }
+                }
+            }
+        }
+        let systems = self.linearize();
+        let (matrix, _, _) = self.reduced(&systems, 0.0);
+        let globals = matrix.nrows();
+        let covariance = matrix.cholesky().map_or_else(|| DMatrix::identity(globals, globals), |c| c.inverse());
+        let moves = (0..self.joints.len())
+            .map(|j| {
+                self.slots.iter().map(|w| w[j].windows(2).filter(|pair| pair[0] != pair[1]).count()).sum()
+            })
+            .collect();
+        KinematicFit {
+            joints: self.joints,
+            positions: self.positions,
+            contact_points: self.contact_points,
+            tool_offset: self.tool_offset,
+            covariance,
+            cost,
+            moves,
+            converged,
+        }
+    }
+}
+
+struct LocalSolve {
+    coupling: DMatrix<f64>,
+    gradient: DVector<f64>,
+}
+
+#[derive(Clone, Copy)]
+enum Slot {
+    Local(usize),
+    Global(usize),
+}
+
+fn accumulate<const R: usize>(
+    system: &mut WindowSystem,
+    jacobian: &[(Slot, nalgebra::SVector<f64, R>)],
+    information: &nalgebra::SMatrix<f64, R, R>,
+    residual: &nalgebra::SVector<f64, R>,
+) {
+    for (at, column) in jacobian {
+        let weighted = information * column;
+        let slope = weighted.dot(residual);
+        match *at {
+            Slot::Local(row) => system.local_gradient[row] += slope,
+            Slot::Global(row) => system.global_gradient[row] += slope,
+        }
+        for (other, other_column) in jacobian {
+            let value = weighted.dot(other_column);
+            match (*at, *other) {
+                (Slot::Local(row), Slot::Local(column)) => system.local[(row, column)] += value,
+                (Slot::Local(row), Slot::Global(column)) => system.coupling[(row, column)] += value,
+                (Slot::Global(row), Slot::Global(column)) => system.global[(row, column)] += value,
+                (Slot::Global(_), Slot::Local(_)) => {}
+            }
+        }
+    }
+}
+
+/// log(T(−c) D_measured⁻¹ D_predicted T(c)), (angular, linear).
+fn pose_residual(joint: &KinematicJoint, measured: &Pose, predicted: &Pose) -> Vector6<f64> {
+    let center = joint.center;
+    (Pose::from_translation(-center) * measured.inverse() * *predicted * Pose::from_translation(center)).log()
+}
+
+/// Splits frames into runs within which a position stays inside its own uncertainty.
+fn rest_runs(positions: &[f64], sigma: impl Fn(usize) -> f64, deviations: f64) -> Vec<std::ops::Range<usize>> {
+    let mut runs = Vec::new();
+    let mut start = 0;
+    let mut sum = 0.0;
+    for (k, &position) in positions.iter().enumerate() {
+        let count = (k - start) as f64;
+        if k > start && (position - sum / count).abs() > deviations * sigma(k) {
+            runs.push(start..k);
+            start = k;
+            sum = 0.0;
+        }
+        sum += position;
+    }
+    if start < positions.len() {
+        runs.push(start..positions.len());
+    }
+    runs
+}
+
+/// The contact's label, for callers that look a track up.
+impl Contact {
+    /// The tool's position in a frame \[m\].
+    pub fn position(&self, frame: usize) -> Option<Vector3<f64>> {
+        self.track.iter().find(|(k, _, _)| *k == frame).map(|(_, x, _)| *x)
+    }
+}

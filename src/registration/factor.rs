@@ -1,0 +1,141 @@
+//! The point-to-plane factor of one scan: cost, gradient and curvature in the part's pose.
+//!
+//! For a scan point x and the displacement D, y = D⁻¹ x is compared with its nearest surfel (m, n):
+//! e = n · (y − m), with Student-t weights. The pose is perturbed on the right about the model's
+//! centroid c: D(ξ) = D · T(c) · exp(ξ) · T(−c), so ∂e/∂ξ = −((y − c) × n, n), ξ = (angular, linear).
+
+use nalgebra::{Matrix6, Vector3, Vector6};
+
+use super::{PartModel, ScanPoint};
+use crate::math::Pose;
+
+/// Cost of a point that matches nothing: the squared residual of three standard deviations, halved.
+pub const OUTLIER_COST: f64 = 4.5;
+/// Surfels are this far apart \[m\]: a point further off along the surface lies beyond a boundary.
+const BOUNDARY_SLACK: f64 = 0.012;
+
+/// How scans are matched.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct AlignmentSettings {
+    /// Matches further apart than this are outliers \[m\].
+    pub gate: f64,
+    /// Degrees of freedom of the Student-t weights.
+    pub student_freedom: f64,
+    /// Standard deviation of a scan's boundary along the surface \[m\]; infinite: boundaries hold nothing.
+    pub boundary_sigma: f64,
+}
+
+impl Default for AlignmentSettings {
+    fn default() -> Self {
+        Self { gate: 0.030, student_freedom: 3.0, boundary_sigma: 0.010 }
+    }
+}
+
+/// Quadratic model of a scan's cost about one pose.
+#[derive(Clone, Debug)]
+pub struct PoseFactor {
+    /// Curvature in ξ, (angular, linear).
+    pub hessian: Matrix6<f64>,
+    /// Gradient in ξ.
+    pub gradient: Vector6<f64>,
+    /// Robust cost: negative log likelihood up to a constant.
+    pub cost: f64,
+    /// Points that matched.
+    pub matched: usize,
+    /// Points in the scan.
+    pub points: usize,
+}
+
+impl PoseFactor {
+    /// The information that the scan holds once what rough normals pretend to hold is taken off.
+    ///
+    /// Rotations are scaled by the model's `radius` \[m\] and each eigenvalue λ becomes
+    /// max(λ − `false_share` · λ_max, 0).
+    pub fn information(&self, radius: f64, false_share: f64) -> Matrix6<f64> {
+        let scale = Vector6::new(radius, radius, radius, 1.0, 1.0, 1.0);
+        let scaled = Matrix6::from_fn(|i, j| self.hessian[(i, j)] / (scale[i] * scale[j]));
+        let mut eigen = scaled.symmetric_eigen();
+        let off = false_share * eigen.eigenvalues.max();
+        eigen.eigenvalues.apply(|x| *x = (*x - off).max(0.0));
+        let clean = eigen.recompose();
+        Matrix6::from_fn(|i, j| clean[(i, j)] * scale[i] * scale[j])
+    }
+}
+
+/// The factor of a scan at a pose.
+pub fn pose_factor(model: &PartModel, scan: &[ScanPoint], displacement: &Pose, settings: &AlignmentSettings) -> PoseFactor {
+    let mut factor = PoseFactor {
+        hessian: Matrix6::zeros(),
+        gradient: Vector6::zeros(),
+        cost: 0.0,
+        matched: 0,
+        points: scan.len(),
+    };
+    let reference_from_world = displacement.inverse();
+    for scan_point in scan {
+        let y = reference_from_world.transform_point(&scan_point.point_in_world);
+        let Some(index) = matching_surfel(model, scan_point, &y, &reference_from_world) else {
+            factor.cost += OUTLIER_COST;
+            continue;
+        };
+        let surfel = &model.surfels[index];
+        let offset = y - surfel.point;
+        let e = surfel.normal.dot(&offset);
+        if e.abs() > settings.gate {
+            factor.cost += OUTLIER_COST;
+            continue;
+        }
+        factor.matched += 1;
+        let arm = y - model.centroid;
+        add_residual(&mut factor, e, surfel.sigma, &surfel.normal, &arm, settings.student_freedom);
+        let along = offset - surfel.normal * e;
+        let distance = along.norm();
+        if distance > BOUNDARY_SLACK && settings.boundary_sigma.is_finite() {
+            let direction = along / distance;
+            add_residual(&mut factor, distance - BOUNDARY_SLACK, settings.boundary_sigma, &direction, &arm, settings.student_freedom);
+        }
+    }
+    factor
+}
+
+/// Mean truncated cost per point, between 0 and `OUTLIER_COST`: for comparing far-apart poses.
+pub fn truncated_cost(model: &PartModel, scan: &[ScanPoint], stride: usize, displacement: &Pose) -> f64 {
+    let reference_from_world = displacement.inverse();
+    let mut cost = 0.0;
+    let mut count = 0.0;
+    for scan_point in scan.iter().step_by(stride.max(1)) {
+        count += 1.0;
+        let y = reference_from_world.transform_point(&scan_point.point_in_world);
+        cost += matching_surfel(model, scan_point, &y, &reference_from_world).map_or(OUTLIER_COST, |index| {
+            let surfel = &model.surfels[index];
+            let offset = y - surfel.point;
+            let e = surfel.normal.dot(&offset);
+            let along = ((offset - surfel.normal * e).norm() - BOUNDARY_SLACK).max(0.0);
+            (0.5 * (e / surfel.sigma).powi(2) + 0.5 * (along / 0.010).powi(2)).min(OUTLIER_COST)
+        });
+    }
+    if count > 0.0 { cost / count } else { 0.0 }
+}
+
+/// The nearest surfel that faces the sensor, if any is in reach.
+fn matching_surfel(model: &PartModel, scan_point: &ScanPoint, y: &Vector3<f64>, reference_from_world: &Pose) -> Option<usize> {
+    let [first, second] = model.field.nearest(y);
+    let first = first? as usize;
+    let Some(viewpoint) = scan_point.viewpoint_in_world else { return Some(first) };
+    let view = reference_from_world.transform_point(&viewpoint) - y;
+    let faces = |index: usize| !model.surfels[index].sided || model.surfels[index].normal.dot(&view) > 0.0;
+    if faces(first) {
+        return Some(first);
+    }
+    second.map(|index| index as usize).filter(|&index| faces(index))
+}
+
+fn add_residual(factor: &mut PoseFactor, e: f64, sigma: f64, direction: &Vector3<f64>, arm: &Vector3<f64>, freedom: f64) {
+    let normalized = e / sigma;
+    let weight = (freedom + 1.0) / (freedom + normalized * normalized) / (sigma * sigma);
+    factor.cost += 0.5 * (freedom + 1.0) * (normalized * normalized / freedom).ln_1p();
+    let moment = arm.cross(direction);
+    let jacobian = -Vector6::new(moment.x, moment.y, moment.z, direction.x, direction.y, direction.z);
+    factor.hessian += jacobian * (jacobian * weight).transpose();
+    factor.gradient += jacobian * (weight * e);
+}

@@ -1,0 +1,98 @@
+//! Nearest surfel by look-up: a dense grid around the surface, two sides per cell.
+
+use nalgebra::Vector3;
+
+use super::Surfel;
+
+/// Edge of a cell \[m\].
+const CELL: f64 = 0.010;
+/// How far from the surface the look-up reaches \[m\].
+pub const REACH: f64 = 0.060;
+const NONE: u32 = u32::MAX;
+/// Cells at most; larger parts get coarser cells.
+const MOST_CELLS: f64 = 4e6;
+
+/// For each cell near the surface, the nearest surfel and the nearest one facing the other way.
+#[derive(Clone, Debug)]
+pub struct NearestField {
+    origin: Vector3<f64>,
+    cell: f64,
+    shape: [usize; 3],
+    cells: Vec<[u32; 2]>,
+}
+
+impl NearestField {
+    /// The look-up for these surfels.
+    pub fn new(surfels: &[Surfel]) -> Self {
+        let mut low = Vector3::repeat(f64::INFINITY);
+        let mut high = Vector3::repeat(f64::NEG_INFINITY);
+        for surfel in surfels {
+            low = low.inf(&surfel.point);
+            high = high.sup(&surfel.point);
+        }
+        if surfels.is_empty() {
+            (low, high) = (Vector3::zeros(), Vector3::zeros());
+        }
+        let extent = high - low + Vector3::repeat(2.0 * REACH);
+        let cell = CELL.max((extent.product() / MOST_CELLS).cbrt());
+        let shape = [0, 1, 2].map(|axis| (extent[axis] / cell).ceil() as usize + 1);
+        let mut field = Self {
+            origin: low - Vector3::repeat(REACH),
+            cell,
+            shape,
+            cells: vec![[NONE; 2]; shape.iter().product()],
+        };
+        field.fill(surfels);
+        field
+    }
+
+    fn fill(&mut self, surfels: &[Surfel]) {
+        let mut distances = vec![[f32::INFINITY; 2]; self.cells.len()];
+        let reach = (REACH / self.cell).floor() as i64;
+        for (index, surfel) in surfels.iter().enumerate() {
+            let center = (surfel.point - self.origin) / self.cell;
+            let base = center.map(|x| x.floor() as i64);
+            for x in (base.x - reach).max(0)..=(base.x + reach).min(self.shape[0] as i64 - 1) {
+                for y in (base.y - reach).max(0)..=(base.y + reach).min(self.shape[1] as i64 - 1) {
+                    for z in (base.z - reach).max(0)..=(base.z + reach).min(self.shape[2] as i64 - 1) {
+                        let middle = Vector3::new(x as f64 + 0.5, y as f64 + 0.5, z as f64 + 0.5);
+                        let distance = (middle - center).norm() as f32;
+                        if f64::from(distance) * self.cell > REACH {
+                            continue;
+                        }
+                        let at = (x as usize * self.shape[1] + y as usize) * self.shape[2] + z as usize;
+                        insert(&mut self.cells[at], &mut distances[at], index as u32, distance, surfels);
+                    }
+                }
+            }
+        }
+    }
+
+    /// The surfels nearest to `point`: the nearest, and the nearest of those that face away from it.
+    pub fn nearest(&self, point: &Vector3<f64>) -> [Option<u32>; 2] {
+        let scaled = (point - self.origin) / self.cell;
+        if scaled.min() < 0.0 {
+            return [None; 2];
+        }
+        let (x, y, z) = (scaled.x as usize, scaled.y as usize, scaled.z as usize);
+        if x >= self.shape[0] || y >= self.shape[1] || z >= self.shape[2] {
+            return [None; 2];
+        }
+        self.cells[(x * self.shape[1] + y) * self.shape[2] + z].map(|index| (index != NONE).then_some(index))
+    }
+}
+
+/// Keeps the nearest surfel of a cell, and the nearest facing the other way (normals over 90° apart).
+fn insert(cell: &mut [u32; 2], distances: &mut [f32; 2], index: u32, distance: f32, surfels: &[Surfel]) {
+    let opposed = |a: u32, b: u32| surfels[a as usize].normal.dot(&surfels[b as usize].normal) < 0.0;
+    if distance < distances[0] {
+        if cell[0] != NONE && opposed(cell[0], index) {
+            (cell[1], distances[1]) = (cell[0], distances[0]);
+        } else if cell[1] != NONE && !opposed(cell[1], index) {
+            (cell[1], distances[1]) = (NONE, f32::INFINITY);
+        }
+        (cell[0], distances[0]) = (index, distance);
+    } else if distance < distances[1] && opposed(cell[0], index) {
+        (cell[1], distances[1]) = (index, distance);
+    }
+}

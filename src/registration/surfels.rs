@@ -1,0 +1,255 @@
+//! A part's reference model: surfels with outward normals, grown from registered scans.
+
+use std::collections::BTreeMap;
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::ScanPoint;
+use super::field::NearestField;
+use crate::math::Pose;
+
+/// Edge of the averaging voxels \[m\].
+const VOXEL: f64 = 0.010;
+/// Radius over which normals are fitted \[m\]: disparity steps are millimetres to centimetres at
+/// 2 m, and a smaller radius sees them as slopes.
+const NORMAL_RADIUS: f64 = 0.045;
+/// A plane takes over the surfels within this angle of it: cos 20°.
+const SNAP_COSINE: f64 = 0.94;
+/// A plane needs this many surfels to snap others to it.
+const PLANE_SURFELS: usize = 20;
+/// Viewing directions are told apart by the nearest of the 12 vertices of an icosahedron.
+const GOLDEN: f64 = 1.618_033_988_749_895;
+/// A voxel's mean gains nothing from more points than this; it also bounds drift of old sums.
+const FULL_VOXEL: f64 = 400.0;
+
+/// A small piece of surface at the reference configuration.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Surfel {
+    /// Centre \[m\].
+    pub point: Vector3<f64>,
+    /// Unit normal, towards the side it was seen from (either side for fused clouds).
+    pub normal: Vector3<f64>,
+    /// Standard deviation of scan points along the normal \[m\].
+    pub sigma: f64,
+    /// Whether the viewing side is known.
+    pub sided: bool,
+}
+
+#[derive(Clone, Debug, Default)]
+struct VoxelSum {
+    count: f64,
+    sum: Vector3<f64>,
+    outer: Matrix3<f64>,
+}
+
+/// Accumulates registered scans of one part into voxel averages; memory is bounded by its surface.
+#[derive(Clone, Debug, Default)]
+pub struct SurfelAccumulator {
+    /// Keyed by viewing side (0 unknown, 1..=12) and voxel.
+    voxels: BTreeMap<(u8, [i32; 3]), VoxelSum>,
+    views: BTreeMap<u8, Vector3<f64>>,
+    scans: usize,
+}
+
+impl SurfelAccumulator {
+    /// How many scans went in.
+    pub fn scans(&self) -> usize {
+        self.scans
+    }
+
+    /// Adds a scan of the part at `displacement` from its reference configuration.
+    pub fn add(&mut self, points: &[ScanPoint], displacement: &Pose) {
+        let reference_from_world = displacement.inverse();
+        for scan_point in points {
+            let point = reference_from_world.transform_point(&scan_point.point_in_world);
+            let side = scan_point.viewpoint_in_world.map_or(0, |viewpoint| {
+                let view = (reference_from_world.transform_point(&viewpoint) - point).normalize();
+                let side = viewing_side(&view);
+                *self.views.entry(side).or_default() += view;
+                side
+            });
+            let key = point.map(|x| (x / VOXEL).floor() as i32);
+            let voxel = self.voxels.entry((side, [key.x, key.y, key.z])).or_default();
+            if voxel.count < FULL_VOXEL {
+                voxel.count += 1.0;
+                voxel.sum += point;
+                voxel.outer += point * point.transpose();
+            }
+        }
+        self.scans += 1;
+    }
+
+    /// Mean positions of the occupied voxels \[m\], those seen in at least `least` points.
+    pub fn voxel_means(&self, least: f64) -> Vec<Vector3<f64>> {
+        self.voxels.values().filter(|v| v.count >= least).map(|v| v.sum / v.count).collect()
+    }
+
+    /// The surfel model of everything added so far; `None` with fewer than `PLANE_SURFELS` surfels.
+    pub fn build(&self) -> Option<PartModel> {
+        let least = (0.1 * self.scans as f64).clamp(1.0, 3.0);
+        let mut surfels = Vec::new();
+        let mut sides: Vec<u8> = self.voxels.keys().map(|(side, _)| *side).collect();
+        sides.dedup();
+        for side in sides {
+            let view = self.views.get(&side).map(|v| v.normalize());
+            let mut side_surfels = self.surfels_of_side(side, view.as_ref(), least);
+            snap_to_planes(&mut side_surfels);
+            surfels.append(&mut side_surfels);
+        }
+        (surfels.len() >= PLANE_SURFELS).then(|| PartModel::new(surfels))
+    }
+
+    fn surfels_of_side(&self, side: u8, view: Option<&Vector3<f64>>, least: f64) -> Vec<Surfel> {
+        let reach = (NORMAL_RADIUS / VOXEL).ceil() as i32;
+        let mut surfels = Vec::new();
+        let range = (side, [i32::MIN; 3])..=(side, [i32::MAX; 3]);
+        for (&(_, key), voxel) in self.voxels.range(range).filter(|(_, v)| v.count >= least) {
+            let center = voxel.sum / voxel.count;
+            let mut count = 0.0;
+            let mut sum = Vector3::zeros();
+            let mut outer = Matrix3::zeros();
+            for dx in -reach..=reach {
+                for dy in -reach..=reach {
+                    let low = (side, [key[0] + dx, key[1] + dy, key[2] - reach]);
+                    let high = (side, [key[0] + dx, key[1] + dy, key[2] + reach]);
+                    for neighbour in self.voxels.range(low..=high).map(|(_, v)| v).filter(|v| v.count >= least) {
+                        if (neighbour.sum / neighbour.count - center).norm() <= NORMAL_RADIUS {
+                            count += neighbour.count;
+                            sum += neighbour.sum;
+                            outer += neighbour.outer;
+                        }
+                    }
+                }
+            }
+            if count < 8.0 {
+                continue;
+            }
+            let mean = sum / count;
+            let eigen = (outer / count - mean * mean.transpose()).symmetric_eigen();
+            let thin = eigen.eigenvalues.imin();
+            let mut spread: Vec<f64> = eigen.eigenvalues.iter().copied().collect();
+            spread.sort_by(f64::total_cmp);
+            if spread[0] > 0.4 * spread[1] {
+                continue;
+            }
+            let mut normal: Vector3<f64> = eigen.eigenvectors.column(thin).into();
+            if let Some(view) = view {
+                normal *= normal.dot(view).signum();
+            }
+            surfels.push(Surfel {
+                point: center - normal * normal.dot(&(center - mean)),
+                normal,
+                sigma: spread[0].max(0.0).sqrt().clamp(0.001, 0.020),
+                sided: view.is_some(),
+            });
+        }
+        surfels
+    }
+}
+
+/// Which of 12 viewing directions, from 1.
+fn viewing_side(view: &Vector3<f64>) -> u8 {
+    let mut best = (f64::NEG_INFINITY, 0);
+    for index in 0..12u8 {
+        let a = if index & 1 == 0 { 1.0 } else { -1.0 };
+        let b = if index & 2 == 0 { GOLDEN } else { -GOLDEN };
+        let vertex = match index / 4 {
+            0 => Vector3::new(0.0, a, b),
+            1 => Vector3::new(a, b, 0.0),
+            _ => Vector3::new(b, 0.0, a),
+        };
+        let cosine = vertex.dot(view);
+        if cosine > best.0 {
+            best = (cosine, index + 1);
+        }
+    }
+    best.1
+}
+
+/// Replaces the normals and offsets of surfels that lie in a common plane by the plane's own.
+///
+/// Local normals carry the noise of a few dozen points; read as geometry they would pretend to
+/// hold a flat panel against sliding along itself.
+fn snap_to_planes(surfels: &mut [Surfel]) {
+    let mut free: Vec<usize> = (0..surfels.len()).collect();
+    for _ in 0..6 {
+        let stride = (free.len() / 150).max(1);
+        let mut best: Vec<usize> = Vec::new();
+        for &seed in free.iter().step_by(stride) {
+            let members = plane_members(surfels, &free, &surfels[seed].point, &surfels[seed].normal);
+            if members.len() > best.len() {
+                best = members;
+            }
+        }
+        let mut plane = None;
+        for _ in 0..4 {
+            if best.len() < PLANE_SURFELS {
+                return;
+            }
+            let (center, normal) = fit_plane(surfels, &best);
+            best = plane_members(surfels, &free, &center, &normal);
+            plane = Some((center, normal));
+        }
+        let Some((center, normal)) = plane else { return };
+        for &index in &best {
+            let surfel = &mut surfels[index];
+            let sign = surfel.normal.dot(&normal).signum();
+            surfel.normal = normal * sign;
+            surfel.point -= normal * normal.dot(&(surfel.point - center));
+        }
+        free.retain(|index| !best.contains(index));
+    }
+}
+
+fn plane_members(surfels: &[Surfel], free: &[usize], center: &Vector3<f64>, normal: &Vector3<f64>) -> Vec<usize> {
+    free.iter()
+        .copied()
+        .filter(|&index| {
+            let surfel = &surfels[index];
+            let height = (surfel.point - center).dot(normal).abs();
+            height < (1.2 * surfel.sigma).max(0.003) && surfel.normal.dot(normal).abs() > SNAP_COSINE
+        })
+        .collect()
+}
+
+fn fit_plane(surfels: &[Surfel], members: &[usize]) -> (Vector3<f64>, Vector3<f64>) {
+    let count = members.len() as f64;
+    let center = members.iter().map(|&i| surfels[i].point).sum::<Vector3<f64>>() / count;
+    let scatter = members
+        .iter()
+        .map(|&i| {
+            let d = surfels[i].point - center;
+            d * d.transpose()
+        })
+        .sum::<Matrix3<f64>>();
+    let eigen = scatter.symmetric_eigen();
+    (center, eigen.eigenvectors.column(eigen.eigenvalues.imin()).into())
+}
+
+/// A part's surfels with a nearest-surfel look-up, at the reference configuration.
+#[derive(Clone, Debug)]
+pub struct PartModel {
+    /// The surfels.
+    pub surfels: Vec<Surfel>,
+    /// Mean of the surfels \[m\]: what rotations are taken about.
+    pub centroid: Vector3<f64>,
+    /// Root-mean-square distance from the centroid \[m\]: scales rotations to lengths.
+    pub radius: f64,
+    pub(super) field: NearestField,
+}
+
+impl PartModel {
+    /// A model of the given surfels.
+    pub fn new(surfels: Vec<Surfel>) -> Self {
+        let count = surfels.len().max(1) as f64;
+        let centroid = surfels.iter().map(|s| s.point).sum::<Vector3<f64>>() / count;
+        let variance = surfels.iter().map(|s| (s.point - centroid).norm_squared()).sum::<f64>() / count;
+        let field = NearestField::new(&surfels);
+        Self { surfels, centroid, radius: variance.sqrt().max(0.02), field }
+    }
+
+    /// Distance from a point at the reference configuration to the nearest surfel \[m\].
+    pub fn distance(&self, point: &Vector3<f64>) -> f64 {
+        self.surfels.iter().map(|s| (s.point - point).norm()).fold(f64::INFINITY, f64::min)
+    }
+}
