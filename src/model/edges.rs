@@ -57,16 +57,22 @@ pub fn relative_windows(child: Label, track: Option<&[Vec<Pose>]>, windows: &[&W
             let reference = |k: usize| track.map_or_else(Pose::identity, |t| t[w][k].inverse());
             let moves = track.is_some_and(|t| t[w].windows(2).any(|pair| pair[0] != pair[1]));
             let blur = if moves { PARENT_SIGMA } else { 0.0 };
-            let poses = window.poses.get(&child).map(|poses| {
+            let relative = |poses: &BTreeMap<Label, Vec<Option<PoseMeasurement>>>| {
                 poses
-                    .iter()
-                    .enumerate()
-                    .map(|(k, m)| m.map(|m| PoseMeasurement { displacement: reference(k) * m.displacement, ..m }))
+                    .get(&child)
+                    .map(|poses| {
+                        let seen = |(k, m): (usize, &Option<PoseMeasurement>)| {
+                            m.map(|m| PoseMeasurement { displacement: reference(k) * m.displacement, ..m })
+                        };
+                        (child, poses.iter().enumerate().map(seen).collect())
+                    })
+                    .into_iter()
                     .collect()
-            });
+            };
             WindowObservations {
                 times_s: window.times_s.clone(),
-                poses: poses.map(|p| BTreeMap::from([(child, p)])).unwrap_or_default(),
+                poses: relative(&window.poses),
+                later_faces: relative(&window.later_faces),
                 contacts: window
                     .contacts
                     .iter()
@@ -76,7 +82,7 @@ pub fn relative_windows(child: Label, track: Option<&[Vec<Pose>]>, windows: &[&W
                         track: c.track.iter().map(|(k, x, s)| (*k, reference(*k).transform_point(x), s.hypot(blur))).collect(),
                     })
                     .collect(),
-                wrenches: Vec::new(),
+                ..WindowObservations::default()
             }
         })
         .collect()
