@@ -171,7 +171,8 @@ fn forward(joints: &[KinematicJoint], position: impl Fn(usize) -> f64) -> Vec<Po
 }
 
 /// Fits axes and joint positions to the windows, from the joints' start axes and start positions
-/// (by window, joint, frame). Parents come before their children in `joints`.
+/// (by window, joint, frame). Parents come before their children in `joints`. A joint whose start
+/// positions are all the same in a window rests in it: friction holds what is not pushed.
 pub fn fit_kinematics(
     joints: Vec<KinematicJoint>,
     positions: Vec<Vec<Vec<f64>>>,
@@ -272,15 +273,22 @@ impl<'a> Problem<'a> {
         problem
     }
 
-    /// Every frame its own unknown.
+    /// Every frame its own unknown, or one for a whole window where a joint rests.
     fn separate_frames(&mut self) {
-        let joints = self.joints.len();
-        self.slots = self
-            .windows
-            .iter()
-            .map(|w| (0..joints).map(|j| (0..w.times_s.len()).map(|k| j * w.times_s.len() + k).collect()).collect())
-            .collect();
-        self.slot_counts = self.windows.iter().map(|w| joints * w.times_s.len()).collect();
+        self.slots.clear();
+        self.slot_counts.clear();
+        for window in &self.positions {
+            let mut next = 0;
+            let mut slots = Vec::with_capacity(window.len());
+            for positions in window {
+                let resting = positions.windows(2).all(|pair| pair[0] == pair[1]);
+                let count = if resting { 1 } else { positions.len() };
+                slots.push((0..positions.len()).map(|k| next + k.min(count - 1)).collect());
+                next += count;
+            }
+            self.slots.push(slots);
+            self.slot_counts.push(next);
+        }
     }
 
     fn initial_contact_points(&self, window: usize) -> Vec<Vector3<f64>> {

@@ -18,6 +18,8 @@ use crate::types::{AppliedWrench, Label};
 /// A part moved if it ever travelled further than this \[m\].
 const MOVED: f64 = 0.006;
 
+/// A part that stays within this of its place on its parent rests there \[m\].
+const RESTS: f64 = 1e-6;
 /// Scans kept from each window for growing a part's model, and in all.
 const KEYFRAMES_PER_WINDOW: usize = 10;
 const MOST_KEYFRAMES: usize = 40;
@@ -205,11 +207,12 @@ impl Learner {
                 }
                 let track = parent.map(|p| self.tracks[&p].as_slice());
                 let relative = relative_windows(child, track, &windows);
+                let resting = self.resting_windows(child, parent);
                 let rigid = rigid_evidence(&part, &relative, &self.settings);
                 let mut option = ParentEvidence { parent, log_evidence: [rigid; 3], fits: [None, None, None] };
                 for joint_type in [JointType::Prismatic, JointType::Revolute] {
                     let starts = self.start_axes(&part, parent, joint_type, &relative, motions);
-                    let fit = moving_evidence(&part, joint_type, &starts, &relative, &self.settings);
+                    let fit = moving_evidence(&part, joint_type, &starts, &relative, &resting, &self.settings);
                     let slot = joint_type as usize;
                     if let Some(fit) = fit {
                         option.log_evidence[slot] = option.log_evidence[slot].max(fit.log_evidence);
@@ -222,6 +225,20 @@ impl Learner {
             evidence.insert(child, options);
         }
         self.evidence = evidence;
+    }
+
+    /// The windows in which a part keeps its place on a parent, by their tracks.
+    fn resting_windows(&self, child: Label, parent: Option<Label>) -> Vec<bool> {
+        let model = &self.models[&child];
+        (0..self.windows.len())
+            .map(|w| {
+                let relative = |k: usize| {
+                    let reference = parent.map_or_else(Pose::identity, |p| self.tracks[&p][w][k].inverse());
+                    reference * self.tracks[&child][w][k]
+                };
+                (1..self.windows[w].times_s.len()).all(|k| travel(model, &relative(0), &relative(k)) < RESTS)
+            })
+            .collect()
     }
 
     /// The evidence so far, where neither part moved in the window: it adds the same to every type.
