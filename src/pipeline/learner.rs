@@ -20,6 +20,8 @@ const MOVED: f64 = 0.006;
 
 /// A part that stays within this of its place on its parent rests there \[m\].
 const RESTS: f64 = 1e-6;
+/// A face's normal suggests an axis within 15° of it.
+const SUGGESTION_COSINE: f64 = 0.966;
 /// Scans kept from each window for growing a part's model, and in all.
 const KEYFRAMES_PER_WINDOW: usize = 10;
 const MOST_KEYFRAMES: usize = 40;
@@ -349,6 +351,7 @@ impl Learner {
                     axis: *axis,
                     center: part.center,
                     radius: part.radius,
+                    suggested: self.suggested_direction(*child, *parent, &axis.direction),
                 }
             })
             .collect();
@@ -380,6 +383,25 @@ impl Learner {
             }
         }
         self.fit = Some(fit);
+    }
+
+    /// The direction nearest to an axis among the normals of the faces of the part, its parent and the
+    /// root, and their common perpendiculars; `None` beyond 15°.
+    fn suggested_direction(&self, child: Label, parent: Option<Label>, axis: &Vector3<f64>) -> Option<Vector3<f64>> {
+        let labels = [Some(child), parent, Some(self.root)];
+        let mut candidates = Vec::new();
+        for label in labels.into_iter().flatten() {
+            let normals = self.models.get(&label).map(PartModel::face_normals).unwrap_or_default();
+            for (i, first) in normals.iter().enumerate() {
+                candidates.push(*first);
+                candidates.extend(normals[..i].iter().filter_map(|second| {
+                    let cross = first.cross(second);
+                    (cross.norm() > 0.98).then(|| cross.normalize())
+                }));
+            }
+        }
+        let nearest = candidates.into_iter().max_by(|a, b| a.dot(axis).abs().total_cmp(&b.dot(axis).abs()))?;
+        (nearest.dot(axis).abs() > SUGGESTION_COSINE).then_some(nearest)
     }
 
     /// Keeps scans of the parts that moved, and grows their models.
