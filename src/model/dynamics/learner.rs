@@ -6,7 +6,7 @@ use nalgebra::{DMatrix, DVector, Vector3};
 
 use super::layout::{JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism, UPPER, joint_models};
 use super::site::{FittedWindow, WindowFit, inertial_entries, load_factor};
-use super::track::{TrackKinematics, TrackSource, joint_track};
+use super::track::{TrackKinematics, TrackSource, joint_track, touched_label};
 use crate::geometry::HullProperties;
 use crate::inference::{Belief, Factor, Failure, Gaussian, Joint};
 use crate::math::orthonormal_pair;
@@ -22,8 +22,6 @@ const STEPS: usize = 14;
 const REVISIT_STEPS: usize = 12;
 /// A stop is believed if it raises the log evidence by this.
 const STOP_EVIDENCE: f64 = 4.0;
-/// An axis that turned or moved by less than this share of its deviation needs no revisit.
-const SETTLED: f64 = 0.3;
 
 /// What a block of numbers is about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -75,6 +73,8 @@ struct WindowMemory {
     axes: BTreeMap<Label, Axis>,
     tool_offset: Vector3<f64>,
     learned: bool,
+    /// When it was last learned, in windows.
+    turn: usize,
 }
 
 /// Learns the dynamics from windows, given the kinematic fit of all of them.
@@ -122,11 +122,13 @@ impl DynamicsLearner {
         }
         let mut result = self.learn(newest, fit, input, STEPS).unwrap_or_else(|failure| WindowInference { failure: Some(failure), ..WindowInference::default() });
         let mut budget = REVISIT_STEPS;
-        for window in self.stale(newest, fit) {
+        for window in self.stale(newest) {
             if budget == 0 {
                 break;
             }
-            let spent = self.learn(window, fit, input, budget.min(STEPS)).map_or(1, |r| r.steps);
+            // A warm start needs two or three steps.
+            let steps = if self.windows[window].learned { 3 } else { STEPS };
+            let spent = self.learn(window, fit, input, steps).map_or(1, |r| r.steps);
             budget = budget.saturating_sub(spent.max(1));
             result.steps += spent;
         }
@@ -177,8 +179,10 @@ impl DynamicsLearner {
     }
 
     fn forget(&mut self, label: Label) {
-        for window in self.belief.drop_sites_of(&Block::Dynamics(label)) {
-            self.windows[window].learned = false;
+        for block in [Block::Dynamics(label), Block::Axis(label)] {
+            for window in self.belief.drop_sites_of(&block) {
+                self.windows[window].learned = false;
+            }
         }
         self.belief.remove_prior(&Block::Dynamics(label));
     }
@@ -259,23 +263,31 @@ impl DynamicsLearner {
         }
     }
 
-    /// Older windows worth another look: unlearned ones, then in order of age.
-    fn stale(&self, newest: usize, _fit: &KinematicFit) -> Vec<usize> {
-        let _ = SETTLED;
+    /// Older windows: unlearned ones first, then those that were looked at longest ago.
+    fn stale(&self, newest: usize) -> Vec<usize> {
         let mut windows: Vec<usize> = (0..newest).collect();
-        windows.sort_by_key(|&w| (self.windows[w].learned, w));
+        windows.sort_by_key(|&w| (self.windows[w].learned, self.windows[w].turn, w));
         windows
     }
 
     /// Which joints move in a window, and where the others rest.
+    /// Joints in another branch than the touched part's are left out: nothing known drives them.
     fn moving(&self, window: usize, fit: &KinematicFit) -> (Vec<usize>, Vec<Option<f64>>) {
+        let root = |mut k: usize| {
+            while let Some(p) = fit.joints[k].parent {
+                k = p;
+            }
+            k
+        };
+        let touched = touched_label(&self.windows[window].contacts);
+        let branch = touched.and_then(|label| fit.joints.iter().position(|j| j.child == label)).map(root);
         let mut moving = Vec::new();
         let mut frozen = vec![None; fit.joints.len()];
         for (k, joint) in fit.joints.iter().enumerate() {
             let positions = &fit.positions[window][k];
             let (low, high) = range(positions);
             let rest = if joint.joint_type == JointType::Revolute { REST_ANGLE } else { REST };
-            if high - low > rest {
+            if high - low > rest && branch == Some(root(k)) {
                 moving.push(k);
             } else {
                 frozen[k] = Some(positions.iter().sum::<f64>() / positions.len().max(1) as f64);
@@ -347,7 +359,8 @@ impl DynamicsLearner {
         let mut fitted = self.fit_window(window, fit, input, &moving, &frozen, steps)?;
         let mut spent = fitted.1.steps;
         // Stops where the joint arrived at the end of its range.
-        for (joint, side, position) in self.halts(window, fit, &moving) {
+        let halts = if self.windows[window].learned { Vec::new() } else { self.halts(window, fit, &moving) };
+        for (joint, side, position) in halts {
             let label = fit.joints[joint].child;
             let before = self.joints.get(&label).cloned();
             if let Some(memory) = self.joints.get_mut(&label) {
@@ -369,8 +382,10 @@ impl DynamicsLearner {
         }
         let (factor, result) = fitted;
         self.belief.replace(window, factor);
+        let turn = self.windows.len();
         let memory = &mut self.windows[window];
         memory.learned = true;
+        memory.turn = turn;
         memory.noise_scale = Some(result.noise_scale);
         memory.axes = fit.joints.iter().map(|j| (j.child, j.axis)).collect();
         memory.tool_offset = fit.tool_offset;
@@ -517,23 +532,30 @@ impl DynamicsLearner {
                 total += model.size();
             }
         }
-        for joint in &fit.joints {
-            blocks.push((Block::Axis(joint.child), joint.axis_parameters()));
+        // Kinematic numbers that do not matter stay out of the site.
+        let mut columns: Vec<usize> = Vec::new();
+        let kinematic = fit.joints.iter().map(|j| (Block::Axis(j.child), j.axis_parameters())).chain([(Block::ToolOffset, 3)]);
+        let mut column = 0;
+        for (block, length) in kinematic {
+            if (column..column + length).any(|c| sensitivity.column(c).amax() > 0.0) {
+                blocks.push((block, length));
+                columns.extend(column..column + length);
+            }
+            column += length;
         }
-        blocks.push((Block::ToolOffset, 3));
-        let kinematic = sensitivity.ncols();
         let p = window.active.len();
-        let mut map = DMatrix::zeros(p, p + kinematic);
-        map.view_mut((0, 0), (p, p)).copy_from(&DMatrix::identity(p, p));
-        map.view_mut((0, p), (p, kinematic)).copy_from(sensitivity);
-        places.extend(total..total + kinematic);
+        let map = DMatrix::from_fn(p, p + columns.len(), |i, j| match j.checked_sub(p) {
+            None => f64::from(u8::from(i == j)),
+            Some(j) => sensitivity[(i, columns[j])],
+        });
+        places.extend(total..total + columns.len());
         let linear = &fitted.solution.linearization;
         let gaussian = Gaussian {
             precision: &linear.curvature / fitted.reduction,
             information: (&linear.curvature * &fitted.solution.point - &linear.gradient) / fitted.reduction,
         }
         .pull_back(&map, &DVector::zeros(p));
-        let mut whole = Gaussian::flat(total + kinematic);
+        let mut whole = Gaussian::flat(total + columns.len());
         whole.multiply_at(&gaussian, &places);
         Factor { blocks, gaussian: whole }
     }
@@ -550,7 +572,7 @@ fn starts(mean: &DVector<f64>, covariance: &DMatrix<f64>, active: &[usize], mech
             let offset = mechanism.offset(joint);
             for (entry, shift) in [(DAMPING, towards_damping), (FRICTION, towards_friction)] {
                 if let Some(i) = active.iter().position(|&a| a == offset + entry)
-                    && covariance[(i, i)] > 0.5
+                    && covariance[(i, i)] > 1.0
                 {
                     start[i] += shift;
                     open = true;

@@ -106,47 +106,81 @@ impl WindowFit<'_> {
         }
     }
 
-    /// Fits the window from the prior's mean and from `starts`.
+    /// Fits the window from the best of `starts`. κ is chosen anew unless it is given.
     pub fn fit(&self, prior: &Gaussian, starts: &[DVector<f64>], noise_scale: Option<f64>, steps: usize) -> Result<FittedWindow, Failure> {
         let mut spent = 0;
-        let mut best: Option<(f64, Solution)> = None;
-        let mut run = |start: &DVector<f64>, scale: f64, steps: usize| {
-            let mut problem = self.problem(scale);
-            let solution = solve(&mut problem, prior, start, &SolverSettings { steps, ..SolverSettings::default() })?;
-            spent += solution.steps;
-            let evidence = solution.log_evidence - problem.latest.half_log_determinant - scale_cost(scale);
-            Ok::<_, Failure>((evidence, solution, problem.latest))
-        };
+        let mut best: Option<(f64, DVector<f64>)> = None;
         let first_scale = noise_scale.unwrap_or(NOISE_SCALES[1]);
         for start in starts {
-            let Ok((evidence, solution, _)) = run(start, first_scale, if starts.len() > 1 { steps / 2 } else { steps }) else { continue };
+            if starts.len() == 1 {
+                best = Some((0.0, start.clone()));
+                break;
+            }
+            let mut problem = self.problem(first_scale);
+            let settings = SolverSettings { steps: (steps / 3).max(3), ..SolverSettings::default() };
+            let Ok(solution) = solve(&mut problem, prior, start, &settings) else { continue };
+            spent += solution.steps;
+            let evidence = solution.log_evidence - problem.latest.half_log_determinant;
             if best.as_ref().is_none_or(|(other, _)| evidence > *other) {
-                best = Some((evidence, solution));
+                best = Some((evidence, solution.point));
             }
         }
-        let (_, start) = best.ok_or(Failure::Diverged)?;
-        // κ by ascent from where it was, then the final fit.
-        let mut at = NOISE_SCALES.iter().position(|s| *s >= first_scale).unwrap_or(0);
-        let mut current = run(&start.point, NOISE_SCALES[at], steps)?;
+        let (_, mut point) = best.ok_or(Failure::Diverged)?;
+        let mut scale = first_scale;
+        let rounds = if noise_scale.is_some() { 1 } else { 2 };
+        for round in 0..rounds {
+            let mut problem = self.problem(scale);
+            let settings = SolverSettings { steps, ..SolverSettings::default() };
+            let solution = solve(&mut problem, prior, &point, &settings)?;
+            spent += solution.steps;
+            if round + 1 < rounds {
+                let (best, tried) = self.best_noise_scale(&solution.point, scale)?;
+                spent += tried;
+                if best != scale {
+                    scale = best;
+                    point = solution.point;
+                    continue;
+                }
+            }
+            let innovations = problem.latest;
+            return Ok(FittedWindow {
+                reduction: reduction(&innovations.whitened, self.source.moving.len()),
+                noise_scale: scale,
+                log_predictive: solution.log_evidence - innovations.half_log_determinant - scale_cost(scale),
+                innovations,
+                solution,
+                steps: spent,
+            });
+        }
+        Err(Failure::Diverged)
+    }
+
+    /// κ of the greatest likelihood at given parameters, by ascent over the grid; how many
+    /// linearizations that took.
+    fn best_noise_scale(&self, point: &DVector<f64>, from: f64) -> Result<(f64, usize), Failure> {
+        let mut x = self.base.clone();
+        for (&at, value) in self.active.iter().zip(point.iter()) {
+            x[at] = *value;
+        }
+        let mut tried = 0;
+        let mut density = |scale: f64| {
+            tried += 1;
+            let innovations = self.model(scale).linearize(&x, &[])?;
+            Ok::<_, Failure>(-innovations.cost() - innovations.half_log_determinant - scale_cost(scale))
+        };
+        let mut at = NOISE_SCALES.iter().position(|s| *s >= from).unwrap_or(0);
+        let mut best = density(NOISE_SCALES[at])?;
         for direction in [1, -1_isize] {
             while let Some(next) = at.checked_add_signed(direction).filter(|i| *i < NOISE_SCALES.len()) {
-                let Ok(trial) = run(&current.1.point, NOISE_SCALES[next], steps.min(3)) else { break };
-                if trial.0 <= current.0 {
+                let trial = density(NOISE_SCALES[next])?;
+                if trial <= best {
                     break;
                 }
-                current = trial;
+                best = trial;
                 at = next;
             }
         }
-        let (log_predictive, solution, innovations) = current;
-        Ok(FittedWindow {
-            reduction: reduction(&innovations.whitened, self.source.moving.len()),
-            noise_scale: NOISE_SCALES[at],
-            log_predictive,
-            innovations,
-            solution,
-            steps: spent,
-        })
+        Ok((NOISE_SCALES[at], tried / 3))
     }
 
     fn problem(&self, scale: f64) -> Problem<'_> {
