@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::Vector3;
 
-use super::kinematics::{AXIS_POINT_PRIOR, Axis, KinematicJoint, KinematicSettings, fit_kinematics};
+use super::kinematics::{Axis, KinematicJoint, KinematicSettings, fit_kinematics};
 use super::window::{Contact, PoseMeasurement, WindowObservations};
 use crate::math::{Pose, Screw, orthonormal_pair};
 use crate::mechanism::JointType;
@@ -22,6 +22,9 @@ pub const MOVE_COST: f64 = 3.0;
 const AXIS_DIRECTION_PRIOR: f64 = 1.0;
 /// Frames of one scene are not independent looks: their evidence is raised to this power.
 const TEMPERATURE: f64 = 0.5;
+
+/// What a moving parent's own track adds to the tool's position seen from it \[m\].
+const PARENT_SIGMA: f64 = 0.002;
 
 /// A part as edges see it.
 #[derive(Clone, Copy, Debug)]
@@ -52,26 +55,34 @@ pub fn relative_windows(child: Label, track: Option<&[Vec<Pose>]>, windows: &[&W
         .enumerate()
         .map(|(w, window)| {
             let reference = |k: usize| track.map_or_else(Pose::identity, |t| t[w][k].inverse());
-            let poses = window.poses.get(&child).map(|poses| {
+            let moves = track.is_some_and(|t| t[w].windows(2).any(|pair| pair[0] != pair[1]));
+            let blur = if moves { PARENT_SIGMA } else { 0.0 };
+            let relative = |poses: &BTreeMap<Label, Vec<Option<PoseMeasurement>>>| {
                 poses
-                    .iter()
-                    .enumerate()
-                    .map(|(k, m)| m.map(|m| PoseMeasurement { displacement: reference(k) * m.displacement, ..m }))
+                    .get(&child)
+                    .map(|poses| {
+                        let seen = |(k, m): (usize, &Option<PoseMeasurement>)| {
+                            m.map(|m| PoseMeasurement { displacement: reference(k) * m.displacement, ..m })
+                        };
+                        (child, poses.iter().enumerate().map(seen).collect())
+                    })
+                    .into_iter()
                     .collect()
-            });
+            };
             WindowObservations {
                 times_s: window.times_s.clone(),
-                poses: poses.map(|p| BTreeMap::from([(child, p)])).unwrap_or_default(),
+                poses: relative(&window.poses),
+                later_faces: relative(&window.later_faces),
                 contacts: window
                     .contacts
                     .iter()
                     .filter(|c| c.label == child)
                     .map(|c| Contact {
                         label: child,
-                        track: c.track.iter().map(|(k, x, s)| (*k, reference(*k).transform_point(x), *s)).collect(),
+                        track: c.track.iter().map(|(k, x, s)| (*k, reference(*k).transform_point(x), s.hypot(blur))).collect(),
                     })
                     .collect(),
-                wrenches: Vec::new(),
+                ..WindowObservations::default()
             }
         })
         .collect()
@@ -93,12 +104,14 @@ pub fn rigid_evidence(part: &EdgePart, windows: &[WindowObservations], settings:
     -TEMPERATURE * fit_kinematics(vec![still], positions, &references, &frozen).cost
 }
 
-/// Fits one moving type from each start axis and keeps the best.
+/// Fits one moving type from each start axis and keeps the best; `resting`: the windows in which the
+/// part keeps its place on the parent.
 pub fn moving_evidence(
     part: &EdgePart,
     joint_type: JointType,
     starts: &[Axis],
     windows: &[WindowObservations],
+    resting: &[bool],
     settings: &KinematicSettings,
 ) -> Option<EdgeFit> {
     let references: Vec<&WindowObservations> = windows.iter().collect();
@@ -114,10 +127,12 @@ pub fn moving_evidence(
                 center: part.center,
                 radius: part.radius,
             };
-            let positions = windows.iter().map(|w| vec![start_positions(&joint, w)]).collect();
+            let positions =
+                windows.iter().zip(resting).map(|(w, rests)| vec![start_positions(&joint, w, *rests)]).collect();
             let fit = fit_kinematics(vec![joint], positions, &references, settings);
             let parameters = joint.axis_parameters();
-            let priors = [AXIS_DIRECTION_PRIOR, AXIS_DIRECTION_PRIOR, AXIS_POINT_PRIOR, AXIS_POINT_PRIOR];
+            let width = joint.axis_point_prior();
+            let priors = [AXIS_DIRECTION_PRIOR, AXIS_DIRECTION_PRIOR, width, width];
             let volume: f64 = (0..parameters)
                 .map(|i| 0.5 * fit.covariance[(i, i)].max(1e-16).ln() - priors[i].ln())
                 .map(|x: f64| x.min(0.0))
@@ -179,19 +194,26 @@ fn far_axes(shift: &Vector3<f64>, center: &Vector3<f64>) -> Vec<Axis> {
         .collect()
 }
 
-/// Joint positions nearest the measured poses: Gauss–Newton on each frame alone.
-fn start_positions(joint: &KinematicJoint, window: &WindowObservations) -> Vec<f64> {
+/// Joint positions nearest the measured poses: Gauss–Newton on each frame alone, or their median
+/// where the joint rests.
+fn start_positions(joint: &KinematicJoint, window: &WindowObservations, rests: bool) -> Vec<f64> {
     let screw = joint.screw();
     let mut last = 0.0;
     let poses = window.poses.get(&joint.child);
-    (0..window.times_s.len())
+    let mut positions: Vec<f64> = (0..window.times_s.len())
         .map(|k| {
             if let Some(m) = poses.and_then(|p| p[k]) {
                 last = nearest_position(joint, &screw, &m, last);
             }
             last
         })
-        .collect()
+        .collect();
+    if rests && !positions.is_empty() {
+        let mut sorted = positions.clone();
+        sorted.sort_by(f64::total_cmp);
+        positions.fill(sorted[sorted.len() / 2]);
+    }
+    positions
 }
 
 fn nearest_position(joint: &KinematicJoint, screw: &Screw, measured: &PoseMeasurement, start: f64) -> f64 {

@@ -2,9 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::Vector3;
+use nalgebra::{DMatrix, Vector3};
 
-use super::explain::{Frame, Motion, Scene, explain_window, measure, travel};
+use super::explain::{Frame, Motion, Scene, explain_window, measure_faces, travel};
 use crate::math::Pose;
 use crate::mechanism::JointType;
 use crate::geometry::{HullProperties, hull_properties};
@@ -13,11 +13,18 @@ use crate::model::{
     Axis, Contact, EdgeFit, EdgePart, KinematicFit, KinematicJoint, KinematicSettings, WindowObservations, axes_from_motion,
     fit_kinematics, moving_evidence, relative_windows, rigid_evidence,
 };
-use crate::registration::{AlignmentSettings, PartModel, SurfelAccumulator, fit_circle, fit_line, truncated_cost};
+use crate::registration::{AlignmentSettings, PartModel, ScanPoint, Surfel, SurfelAccumulator, fit_circle, fit_line, truncated_cost};
+use crate::structure::TreeDistribution;
 use crate::types::{AppliedWrench, Label};
 
 /// A part moved if it ever travelled further than this \[m\].
 const MOVED: f64 = 0.006;
+
+/// A part that stays within this of its place on its parent rests there \[m\].
+const RESTS: f64 = 1e-6;
+/// Scans kept from each window for growing a part's model, and in all.
+const KEYFRAMES_PER_WINDOW: usize = 10;
+const MOST_KEYFRAMES: usize = 40;
 
 /// One closed window, ready to be learned.
 #[derive(Clone, Debug, Default)]
@@ -51,8 +58,10 @@ pub struct Learner {
     pub use_tool: bool,
     /// Reference models.
     pub models: BTreeMap<Label, PartModel>,
-    /// Where the models grow from.
-    pub accumulators: BTreeMap<Label, SurfelAccumulator>,
+    /// Surfels of the first look.
+    reference: BTreeMap<Label, Vec<Surfel>>,
+    /// Scans that the models grow from, with their window and frame.
+    keyframes: BTreeMap<Label, Vec<(usize, usize, Vec<ScanPoint>)>>,
     /// Mean truncated cost per point at known poses.
     pub baselines: BTreeMap<Label, f64>,
     /// Displacements after the last window.
@@ -80,12 +89,14 @@ pub struct Learner {
 impl Learner {
     /// Nothing learned yet: models from the scans accumulated at the reference configuration.
     pub fn new(root: Label, use_tool: bool, accumulators: BTreeMap<Label, SurfelAccumulator>) -> Self {
-        let models = accumulators.iter().filter_map(|(label, a)| Some((*label, a.build()?))).collect();
+        let reference: BTreeMap<Label, Vec<Surfel>> = accumulators.iter().map(|(label, a)| (*label, a.surfels())).collect();
+        let models = reference.iter().filter_map(|(label, s)| Some((*label, PartModel::new(s, &[])?))).collect();
         Self {
             root,
             use_tool,
             models,
-            accumulators,
+            reference,
+            keyframes: BTreeMap::new(),
             baselines: BTreeMap::new(),
             displacements: BTreeMap::new(),
             windows: Vec::new(),
@@ -143,19 +154,26 @@ impl Learner {
             ..WindowObservations::default()
         };
         for (label, motion) in &motions {
-            observations.poses.insert(*label, self.measure_along(*label, &motion.displacements, &job.frames));
             self.tracks.entry(*label).or_default().push(motion.displacements.clone());
         }
         self.windows.push(observations);
-        for round in 0..2 {
-            self.weigh_edges(&motions);
-            self.fit_joints();
-            self.remeasure(job);
-            if round == 1 {
-                self.fit_joints();
+        self.grow(job, &motions);
+        for label in motions.keys() {
+            self.measure(*label, &job.frames);
+        }
+        self.weigh_edges(&motions);
+        self.fit_joints();
+        self.rebuild_models();
+        let labels: Vec<Label> = self.joints().iter().map(|j| j.child).collect();
+        for label in labels {
+            self.measure(label, &job.frames);
+        }
+        self.fit_joints();
+        for (label, tracks) in &self.tracks {
+            if let Some(end) = tracks.last().and_then(|t| t.last()) {
+                self.displacements.insert(*label, *end);
             }
         }
-        self.grow(job);
         self.learn_dynamics(job);
     }
 
@@ -173,13 +191,22 @@ impl Learner {
         self.dynamics_wall_s.push(begin.elapsed().as_secs_f64());
     }
 
-    fn measure_along(&self, label: Label, track: &[Pose], frames: &[Frame]) -> Vec<Option<crate::model::PoseMeasurement>> {
+    /// Measures a part's poses in the last window, about its track.
+    fn measure(&mut self, label: Label, frames: &[Frame]) {
         let settings = AlignmentSettings { gate: 0.02, ..AlignmentSettings::default() };
-        frames
+        let Some(track) = self.tracks.get(&label).and_then(|t| t.last()) else { return };
+        let faces: Vec<_> = frames
             .iter()
             .zip(track)
-            .map(|(frame, displacement)| measure(self.models.get(&label)?, frame.scans.get(&label)?, displacement, &settings))
-            .collect()
+            .map(|(frame, displacement)| match (self.models.get(&label), frame.scans.get(&label)) {
+                (Some(model), Some(scan)) => measure_faces(model, scan, displacement, &settings),
+                _ => [None; 2],
+            })
+            .collect();
+        if let Some(window) = self.windows.last_mut() {
+            window.poses.insert(label, faces.iter().map(|f| f[0]).collect());
+            window.later_faces.insert(label, faces.iter().map(|f| f[1]).collect());
+        }
     }
 
     fn part(&self, label: Label) -> EdgePart {
@@ -205,13 +232,18 @@ impl Learner {
             parents.extend(movers.iter().filter(|l| **l != child).map(|l| Some(*l)));
             let mut options = Vec::new();
             for parent in parents {
+                if let Some(old) = self.unaffected(child, parent, motions) {
+                    options.push(old);
+                    continue;
+                }
                 let track = parent.map(|p| self.tracks[&p].as_slice());
                 let relative = relative_windows(child, track, &windows);
+                let resting = self.resting_windows(child, parent);
                 let rigid = rigid_evidence(&part, &relative, &self.settings);
                 let mut option = ParentEvidence { parent, log_evidence: [rigid; 3], fits: [None, None, None] };
                 for joint_type in [JointType::Prismatic, JointType::Revolute] {
                     let starts = self.start_axes(&part, parent, joint_type, &relative, motions);
-                    let fit = moving_evidence(&part, joint_type, &starts, &relative, &self.settings);
+                    let fit = moving_evidence(&part, joint_type, &starts, &relative, &resting, &self.settings);
                     let slot = joint_type as usize;
                     if let Some(fit) = fit {
                         option.log_evidence[slot] = option.log_evidence[slot].max(fit.log_evidence);
@@ -224,6 +256,34 @@ impl Learner {
             evidence.insert(child, options);
         }
         self.evidence = evidence;
+    }
+
+    /// The windows in which a part keeps its place on a parent, by their tracks.
+    fn resting_windows(&self, child: Label, parent: Option<Label>) -> Vec<bool> {
+        let model = &self.models[&child];
+        (0..self.windows.len())
+            .map(|w| {
+                let relative = |k: usize| {
+                    let reference = parent.map_or_else(Pose::identity, |p| self.tracks[&p][w][k].inverse());
+                    reference * self.tracks[&child][w][k]
+                };
+                (1..self.windows[w].times_s.len()).all(|k| travel(model, &relative(0), &relative(k)) < RESTS)
+            })
+            .collect()
+    }
+
+    /// The evidence so far, where neither part moved in the window: it adds the same to every type.
+    fn unaffected(&self, child: Label, parent: Option<Label>, motions: &BTreeMap<Label, Motion>) -> Option<ParentEvidence> {
+        let moved = |label: Label| motions.get(&label).is_some_and(|m| m.moved);
+        if moved(child) || parent.is_some_and(moved) {
+            return None;
+        }
+        let mut old = self.evidence.get(&child)?.iter().find(|o| o.parent == parent)?.clone();
+        for fit in old.fits.iter_mut().flatten() {
+            let last = fit.positions.last().and_then(|w| w.last()).copied().unwrap_or(0.0);
+            fit.positions.push(vec![last; self.windows.last().map_or(0, |w| w.times_s.len())]);
+        }
+        Some(old)
     }
 
     fn start_axes(
@@ -265,34 +325,44 @@ impl Learner {
         starts
     }
 
-    /// The likeliest parent and type of each mover, as a tree with parents first.
-    fn likeliest(&self) -> Vec<(Label, Option<Label>, JointType, Axis)> {
-        let mut left: BTreeMap<Label, &Vec<ParentEvidence>> = self.evidence.iter().map(|(l, e)| (*l, e)).collect();
-        let mut order: Vec<(Label, Option<Label>, JointType, Axis)> = Vec::new();
-        while !left.is_empty() {
-            // Attach the part whose best parent is already in place, best evidence first.
-            let mut best: Option<(f64, Label, Option<Label>, JointType, Axis)> = None;
-            for (&child, options) in &left {
-                let top = options.iter().map(|o| o.log_evidence[1].max(o.log_evidence[2])).fold(f64::NEG_INFINITY, f64::max);
-                for option in options.iter() {
-                    let placed = option.parent.is_none_or(|p| order.iter().any(|(l, ..)| *l == p));
-                    if !placed {
-                        continue;
-                    }
-                    for joint_type in [JointType::Prismatic, JointType::Revolute] {
-                        let Some(fit) = &option.fits[joint_type as usize] else { continue };
-                        let regret = fit.log_evidence - top;
-                        if best.as_ref().is_none_or(|(b, ..)| regret > *b) {
-                            best = Some((regret, child, option.parent, joint_type, fit.joint.axis));
-                        }
-                    }
+    /// Log weights of the edges between what never moved (node 0) and the parts that did, in the
+    /// order of `evidence`: each the evidence summed over joint types.
+    fn edge_weights(&self) -> DMatrix<f64> {
+        let movers: Vec<Label> = self.evidence.keys().copied().collect();
+        let mut weights = DMatrix::from_element(movers.len() + 1, movers.len() + 1, f64::NEG_INFINITY);
+        for (column, options) in self.evidence.values().enumerate() {
+            for option in options {
+                let row = option.parent.map_or(Some(0), |p| movers.iter().position(|l| *l == p).map(|i| i + 1));
+                if let Some(row) = row {
+                    weights[(row, column + 1)] = log_mean_exp(&option.log_evidence);
                 }
             }
-            let Some((_, child, parent, joint_type, axis)) = best else { break };
-            order.push((child, parent, joint_type, axis));
-            left.remove(&child);
         }
-        order
+        weights
+    }
+
+    /// The likeliest parent and type of each mover, as a tree with parents first.
+    fn likeliest(&self) -> Vec<(Label, Option<Label>, JointType, Axis)> {
+        let movers: Vec<Label> = self.evidence.keys().copied().collect();
+        let tree = match TreeDistribution::new(&self.edge_weights()) {
+            Ok(distribution) => distribution.most_likely(),
+            Err(error) => {
+                tracing::warn!(%error, "no tree explains the parts");
+                return Vec::new();
+            }
+        };
+        tree.topological_order()
+            .into_iter()
+            .filter(|node| *node > 0)
+            .filter_map(|node| {
+                let child = movers[node - 1];
+                let parent = tree.parent(node).and_then(|p| p.checked_sub(1)).map(|p| movers[p]);
+                let option = self.evidence[&child].iter().find(|o| o.parent == parent)?;
+                let fits = [JointType::Prismatic, JointType::Revolute].map(|t| option.fits[t as usize].as_ref());
+                let fit = fits.into_iter().flatten().max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence))?;
+                Some((child, parent, fit.joint.joint_type, fit.joint.axis))
+            })
+            .collect()
     }
 
     /// Fits all joints of the likeliest tree to all windows.
@@ -343,34 +413,46 @@ impl Learner {
         self.fit = Some(fit);
     }
 
-    /// Takes the window's measurements again, at the fitted poses.
-    fn remeasure(&mut self, job: &WindowJob) {
-        let last = self.windows.len() - 1;
-        let labels: Vec<Label> = self.joints().iter().map(|j| j.child).collect();
-        for label in labels {
-            let measured = self.measure_along(label, &self.tracks[&label][last], &job.frames);
-            self.windows[last].poses.insert(label, measured);
-        }
-    }
-
-    /// Adds what the window showed of new faces to the models.
-    fn grow(&mut self, job: &WindowJob) {
-        let last = self.windows.len() - 1;
-        for (label, tracks) in &self.tracks {
-            let track = &tracks[last];
-            if let Some(end) = track.last() {
-                self.displacements.insert(*label, *end);
-            }
-            let Some(accumulator) = self.accumulators.get_mut(label) else { continue };
-            let every = (job.frames.len() / 8).max(1);
-            for (frame, displacement) in job.frames.iter().zip(track).step_by(every) {
-                if let Some(scan) = frame.scans.get(label) {
-                    accumulator.add(scan, displacement);
+    /// Keeps scans of the parts that moved, and grows their models.
+    fn grow(&mut self, job: &WindowJob, motions: &BTreeMap<Label, Motion>) {
+        let window = self.windows.len() - 1;
+        for (label, _) in motions.iter().filter(|(_, motion)| motion.moved) {
+            let keyframes = self.keyframes.entry(*label).or_default();
+            let every = job.frames.len().div_ceil(KEYFRAMES_PER_WINDOW).max(1);
+            for (frame, content) in job.frames.iter().enumerate().step_by(every) {
+                if let Some(scan) = content.scans.get(label) {
+                    keyframes.push((window, frame, scan.clone()));
                 }
             }
-            if let Some(model) = accumulator.build() {
+            while keyframes.len() > MOST_KEYFRAMES {
+                // Thin out the older half.
+                let mut index = 0;
+                let half = keyframes.len() / 2;
+                keyframes.retain(|_| {
+                    index += 1;
+                    index > half || index % 2 == 0
+                });
+            }
+        }
+        self.rebuild_models();
+    }
+
+    /// Models of the moving parts, from the first look and the keyframes where the fit has them now.
+    fn rebuild_models(&mut self) {
+        for (label, keyframes) in &self.keyframes {
+            let mut later = SurfelAccumulator::default();
+            for (window, frame, scan) in keyframes {
+                later.add(scan, &self.tracks[label][*window][*frame]);
+            }
+            let reference = self.reference.get(label).map_or(&[][..], Vec::as_slice);
+            if let Some(model) = PartModel::new(reference, &later.surfels()) {
                 self.models.insert(*label, model);
             }
         }
     }
+}
+
+fn log_mean_exp(values: &[f64]) -> f64 {
+    let top = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    top + (values.iter().map(|v| (v - top).exp()).sum::<f64>() / values.len() as f64).ln()
 }

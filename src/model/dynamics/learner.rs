@@ -216,7 +216,7 @@ impl DynamicsLearner {
         let mut blocks: Vec<(Block, usize)> =
             fit.joints.iter().map(|j| (Block::Axis(j.child), j.axis_parameters())).collect();
         blocks.push((Block::ToolOffset, 3));
-        let mut covariance = fit.covariance.clone();
+        let mut covariance = kinematic_covariance(fit);
         for i in 0..covariance.nrows() {
             covariance[(i, i)] += 1e-12;
         }
@@ -504,16 +504,17 @@ impl DynamicsLearner {
 
     /// Standard deviations of the kinematic numbers that matter to a window; zero for the others.
     fn deviations(&self, fit: &KinematicFit, involved: &[(usize, bool)], touched: bool) -> Vec<f64> {
-        let mut deviations = vec![0.0; fit.covariance.nrows()];
+        let covariance = kinematic_covariance(fit);
+        let mut deviations = vec![0.0; covariance.nrows()];
         for &(joint, whole) in involved {
             let start = fit.axis_offset(joint);
             for i in start..start + fit.joints[joint].axis_parameters() {
-                deviations[i] = if whole { fit.covariance[(i, i)].max(0.0).sqrt() } else { 0.0 };
+                deviations[i] = if whole { covariance[(i, i)].max(0.0).sqrt() } else { 0.0 };
             }
         }
         let start = deviations.len() - 3;
         for (i, deviation) in deviations.iter_mut().enumerate().skip(start) {
-            *deviation = if touched { fit.covariance[(i, i)].max(0.0).sqrt() } else { 0.0 };
+            *deviation = if touched { covariance[(i, i)].max(0.0).sqrt() } else { 0.0 };
         }
         deviations
     }
@@ -599,6 +600,14 @@ fn given_kinematics(joint: &Joint<Block>, blocks: &[Block]) -> Result<Gaussian, 
 
 fn kinematics_of(fit: &KinematicFit) -> TrackKinematics {
     TrackKinematics { axes: fit.joints.iter().map(|j| j.axis).collect(), tool_offset: fit.tool_offset }
+}
+
+/// Covariance of the axes, joint by joint, and the tool's offset, which is last in the fit's.
+fn kinematic_covariance(fit: &KinematicFit) -> DMatrix<f64> {
+    let axes: usize = fit.joints.iter().map(KinematicJoint::axis_parameters).sum();
+    let all = fit.covariance.nrows();
+    let places: Vec<usize> = (0..axes).chain(all - 3..all).collect();
+    DMatrix::from_fn(places.len(), places.len(), |i, j| fit.covariance[(places[i], places[j])])
 }
 
 /// Errors of an axis in the coordinates of `old`, from those in the coordinates of `new`.
