@@ -27,6 +27,8 @@ fn main() {
         std::fs::write(p, o).unwrap();
     }
     let mut edges = vec![];
+    let dynamics = l.dynamics.posterior();
+    if let Err(e) = &dynamics { tracing::warn!("{e}"); }
     if let Some(fit) = &l.fit { for (k, j) in fit.joints.iter().enumerate() {
         let p = j.parent.map_or(l.root, |p| fit.joints[p].child);
         let o = fit.axis_offset(k); let n = j.axis_parameters();
@@ -34,7 +36,11 @@ fn main() {
         let ax = serde_json::json!({"axis_direction": j.axis.direction.as_slice(), "axis_point_m": j.axis.point.as_slice(), "covariance": cov});
         let t = j.joint_type.name();
         edges.push(serde_json::json!({"parent": p.0, "child": j.child.0, "probability": 1.0, "joint_type": {"rigid": if t=="rigid" {1.0} else {0.0}, "prismatic": if t=="prismatic" {1.0} else {0.0}, "revolute": if t=="revolute" {1.0} else {0.0}}, t: ax}));
+        if let Ok(d) = &dynamics && let Some(j) = d.joints.iter().find(|d| d.label == j.child) && let Some(e) = edges.last_mut() {
+            e["damping"] = serde_json::json!(j.damping); e["friction"] = serde_json::json!(j.friction); e["joint_inertia"] = serde_json::json!(j.joint_inertia);
+            e["lower_limit"] = serde_json::json!(j.lower_limit); e["upper_limit"] = serde_json::json!(j.upper_limit);
+        }
     } tracing::info!(offset=?fit.tool_offset.as_slice(), "tool"); }
-    let out = serde_json::json!({"schema":"bom.posterior/1","root_label": l.root.0, "parts": [], "edges": edges, "windows": [], "criticism": {"verdict":"insufficient","effects":[]}});
+    let out = serde_json::json!({"schema":"bom.posterior/1","root_label": l.root.0, "parts": [], "edges": edges, "windows": l.inferences.iter().zip(&l.dynamics_wall_s).map(|(i, w)| serde_json::json!({"steps": i.steps, "inference_wall_s": w, "elbo": i.elbo, "log_predictive_density": i.log_predictive_density, "noise_scale": i.noise_scale, "observations": i.observations, "failure": i.failure.map(|f| f.to_string())})).collect::<Vec<_>>(), "criticism": {"verdict":"insufficient","effects":[]}});
     if let Some(p) = get("--posterior") { std::fs::write(p, out.to_string()).unwrap(); }
 }

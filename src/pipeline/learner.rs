@@ -7,6 +7,8 @@ use nalgebra::{DMatrix, Vector3};
 use super::explain::{Frame, Motion, Scene, explain_window, measure_faces, travel};
 use crate::math::Pose;
 use crate::mechanism::JointType;
+use crate::geometry::{HullProperties, hull_properties};
+use crate::model::{DynamicsInput, DynamicsLearner, WindowInference};
 use crate::model::{
     Axis, Contact, EdgeFit, EdgePart, KinematicFit, KinematicJoint, KinematicSettings, WindowObservations, axes_from_motion,
     fit_kinematics, moving_evidence, relative_windows, rigid_evidence,
@@ -35,6 +37,8 @@ pub struct WindowJob {
     pub contacts: Vec<Contact>,
     /// Wrench readings from before the window to after it.
     pub wrenches: Vec<AppliedWrench>,
+    /// Time zero.
+    pub zero: crate::types::Stamp,
 }
 
 /// Evidence for one parent of a part.
@@ -74,6 +78,14 @@ pub struct Learner {
     pub fit: Option<KinematicFit>,
     /// Kinematic assumptions.
     pub settings: KinematicSettings,
+    /// Friction, damping, inertia and end stops.
+    pub dynamics: DynamicsLearner,
+    /// What learning each window's dynamics gave.
+    pub inferences: Vec<WindowInference>,
+    /// Temporary: wall time of that \[s\].
+    pub dynamics_wall_s: Vec<f64>,
+    /// Hulls of the parts, as first seen.
+    pub hulls: BTreeMap<Label, HullProperties>,
 }
 
 impl Learner {
@@ -94,6 +106,10 @@ impl Learner {
             evidence: BTreeMap::new(),
             fit: None,
             settings: KinematicSettings::default(),
+            dynamics: DynamicsLearner::new(Vector3::new(0.0, 0.0, -9.81)),
+            inferences: Vec::new(),
+            dynamics_wall_s: Vec::new(),
+            hulls: BTreeMap::new(),
         }
     }
 
@@ -160,6 +176,21 @@ impl Learner {
                 self.displacements.insert(*label, *end);
             }
         }
+        self.learn_dynamics(job);
+    }
+
+    fn learn_dynamics(&mut self, job: &WindowJob) {
+        for label in self.models.keys() {
+            if let Some(hull) = self.accumulators.get(label).and_then(|a| hull_properties(&a.voxel_means(3.0), None)) {
+                self.hulls.insert(*label, hull);
+            }
+        }
+        let Some(fit) = &self.fit else { return };
+        let windows: Vec<&WindowObservations> = self.windows.iter().collect();
+        let input = DynamicsInput { windows: &windows, contacts: &job.contacts, zero: job.zero, parts: &self.hulls, use_tool: self.use_tool };
+        let begin = std::time::Instant::now();
+        self.inferences.push(self.dynamics.learn_window(fit, &input));
+        self.dynamics_wall_s.push(begin.elapsed().as_secs_f64());
     }
 
     /// Measures a part's poses in the last window, about its track.
