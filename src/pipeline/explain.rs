@@ -152,7 +152,8 @@ impl Scene<'_> {
     /// is a new face coming into view, not motion.
     fn beats(&self, label: Label, motion: &Motion, still: &Motion) -> bool {
         let gain = still.excess - motion.excess;
-        let seen = gain > EXPLAINED && gain > 0.3 * still.excess;
+        let share = if self.contacts.iter().any(|c| c.label == label) { 0.3 } else { 0.5 };
+        let seen = gain > EXPLAINED && gain > share * still.excess;
         let miss = self.tool_miss(label, &still.displacements);
         let felt = miss > TOOL_EXPLAINED && self.tool_miss(label, &motion.displacements) < 0.5 * miss && gain > -0.2;
         seen || felt
@@ -183,7 +184,7 @@ impl Scene<'_> {
         let still = self.evaluate(label, |_| self.start_of(label));
         if let Some(motion) = &best.motion {
             let held = self.tool_miss(label, &motion.displacements) < 1.5 * TOOL_EXPLAINED;
-            if held && (motion.excess < EXPLAINED || motion.excess < 0.6 * still.excess) {
+            if held && (motion.excess < EXPLAINED || motion.excess < 0.3 * still.excess) {
                 return best.motion;
             }
         }
@@ -195,12 +196,17 @@ impl Scene<'_> {
                 .filter(|(l, m)| !m.moved && travel(&self.models[*l], &Pose::identity(), &self.start_of(**l)) > 0.005)
                 .map(|(l, _)| Some(*l)),
         );
-        let most = if best.score < 2.0 * EXPLAINED { 2 } else { 5 };
+        // A part that nothing touches needs a better reason for a joint of its own: what it shows anew
+        // must not pass for motion.
+        let touched = self.contacts.iter().any(|c| c.label == label);
+        let carried = best.motion.as_ref().map_or(still.excess, |m| m.excess.min(still.excess));
+        let reluctance = 0.02 + if touched { 0.0 } else { 0.1 + 0.4 * carried.max(0.0) };
+        let most = if best.score < 2.0 * EXPLAINED { 2 } else { 4 };
         for (rank, parent) in parents.iter().enumerate() {
             let Some(track) = self.parent_track(*parent, known) else { continue };
             for seed in self.seeds(label, model, &track, most) {
                 let Some(motion) = self.refine(label, *parent, &seed, &track) else { continue };
-                best.offer(score(&motion, 0.02 + if rank > 0 { 0.02 } else { 0.0 }), motion);
+                best.offer(score(&motion, reluctance + if rank > 0 { 0.02 } else { 0.0 }), motion);
             }
         }
         best.motion
