@@ -108,7 +108,7 @@ impl Config {
             .map(|component| component * component)
             .sum::<f64>()
             .sqrt();
-        if !(strength <= 100.0) {
+        if strength.is_nan() || strength > 100.0 {
             return Err((
                 "gravity_m_s2".into(),
                 format!("{:?}, expected at most 100 m/s²", self.gravity_m_s2),

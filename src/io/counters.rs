@@ -4,6 +4,7 @@ use std::{collections::BTreeMap, fmt};
 
 use serde::{Deserialize, Serialize};
 
+use super::bag::Damage;
 use crate::types::Stamp;
 
 /// How many, by reason.
@@ -37,6 +38,15 @@ pub struct Counters {
 }
 
 impl Counters {
+    /// With the damage of a bag counted in, by kind.
+    #[must_use]
+    pub fn with_damage(mut self, damage: &[Damage]) -> Self {
+        for place in damage {
+            Self::add(&mut self.bag_damage, place.kind.kind(), 1);
+        }
+        self
+    }
+
     /// Adds `count` to a reason; a reason with nothing to count is not entered.
     pub fn add(reasons: &mut ByReason, reason: &str, count: u64) {
         if count > 0 {

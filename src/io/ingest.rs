@@ -13,58 +13,13 @@ use super::{
     cdr,
     config::InputConfig,
     counters::{ByReason, Counters, Diagnostic},
-    messages::{
-        Header, POINT_CLOUD_TYPE, POSE_TYPE, PointCloud2, PoseWithCovarianceStamped, TF_TYPE,
-        TfMessage, WRENCH_TYPE, WrenchStamped,
-    },
+    messages::{Header, PointCloud2, PoseWithCovarianceStamped, TfMessage, WrenchStamped},
     point_cloud,
     resolve::{Content, Rejection, WaitingMessage},
+    topics::Role,
     transforms::{TransformBuffer, bare},
 };
-use crate::types::{Input, Label, Stamp};
-
-/// What a topic is to us.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Role {
-    /// Segmented clouds.
-    Cloud,
-    /// The wrench topic of this index in the configuration.
-    Wrench(usize),
-    /// Poses of this part.
-    Pose(Label),
-    /// Moving transforms.
-    Tf,
-    /// Fixed transforms.
-    TfStatic,
-}
-
-impl Role {
-    /// The role of an absolute topic name, if it has one.
-    pub fn of(topic: &str, config: &InputConfig) -> Option<Self> {
-        let is = |name: &String| config.absolute(name) == topic;
-        if config.clouds.iter().any(is) {
-            return Some(Self::Cloud);
-        }
-        if let Some(index) = config.wrenches.iter().position(|wrench| is(&wrench.topic)) {
-            return Some(Self::Wrench(index));
-        }
-        match topic {
-            _ if is(&config.tf) => Some(Self::Tf),
-            _ if is(&config.tf_static) => Some(Self::TfStatic),
-            _ => config.pose_label(topic).map(Self::Pose),
-        }
-    }
-
-    /// The message type that such a topic must have.
-    pub fn type_name(self) -> &'static str {
-        match self {
-            Self::Cloud => POINT_CLOUD_TYPE,
-            Self::Wrench(_) => WRENCH_TYPE,
-            Self::Pose(_) => POSE_TYPE,
-            Self::Tf | Self::TfStatic => TF_TYPE,
-        }
-    }
-}
+use crate::types::{Input, Stamp};
 
 /// The state of reading: transforms, what waits for them, and what was counted.
 #[derive(Debug)]

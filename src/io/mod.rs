@@ -12,6 +12,8 @@ pub mod definitions;
 pub mod ingest;
 pub mod messages;
 pub mod point_cloud;
+mod point_field;
 pub mod pose_information;
 mod resolve;
+pub mod topics;
 pub mod transforms;

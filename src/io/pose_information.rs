@@ -78,7 +78,7 @@ pub fn information_in_world(
 
 /// NaN counts as measured, so that it is refused and not passed over.
 fn is_measured(variance: f64) -> bool {
-    variance != -1.0 && !(variance >= UNKNOWN_VARIANCE)
+    variance.is_nan() || (variance != -1.0 && variance < UNKNOWN_VARIANCE)
 }
 
 fn invert(block: &DMatrix<f64>, rows: &[usize]) -> Result<DMatrix<f64>, CovarianceError> {

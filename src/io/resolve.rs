@@ -55,7 +55,7 @@ pub(super) enum Content {
     Pose {
         label: Label,
         header_from_frame: Pose,
-        covariance: [[f64; 6]; 6],
+        covariance: Box<[[f64; 6]; 6]>,
     },
 }
 
@@ -122,7 +122,7 @@ impl Content {
         Ok(Self::Pose {
             label,
             header_from_frame,
-            covariance: message.covariance,
+            covariance: Box::new(message.covariance),
         })
     }
 }
@@ -164,12 +164,12 @@ impl WaitingMessage {
                 label,
                 header_from_frame,
                 covariance,
-            } => Input::Pose(MeasuredPose {
+            } => Input::Pose(Box::new(MeasuredPose {
                 stamp,
                 label,
                 world_from_frame: *world_from_frame * header_from_frame,
                 information: information(&covariance, world_from_frame, config, stamp)?,
-            }),
+            })),
         })
     }
 }

@@ -336,3 +336,141 @@ impl Sample {
 pub(super) fn bare(frame: &str) -> &str {
     frame.strip_prefix('/').unwrap_or(frame)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::io::messages::{Header, RawTransform};
+    use nalgebra::Vector6;
+
+    fn link(parent: &str, child: &str, stamp_s: f64, pose: Pose) -> TransformStamped {
+        TransformStamped {
+            header: Header {
+                stamp: Stamp::default().plus_seconds(stamp_s).into(),
+                frame_id: parent.into(),
+            },
+            child_frame_id: child.into(),
+            transform: RawTransform::from(pose),
+        }
+    }
+
+    fn at(stamp_s: f64) -> Stamp {
+        Stamp::default().plus_seconds(stamp_s)
+    }
+
+    fn distance(a: &Pose, b: &Pose) -> f64 {
+        (a.rotation - b.rotation).norm() + (a.translation - b.translation).norm()
+    }
+
+    #[test]
+    fn chains_read_world_from_camera() {
+        let world_from_base = Pose::exp(&Vector6::new(0.1, 0.2, 0.3, 1.0, 2.0, 3.0));
+        let base_from_camera = Pose::exp(&Vector6::new(-0.3, 0.1, 0.0, 0.0, 0.5, 1.0));
+        let map_from_world = Pose::exp(&Vector6::new(0.0, 0.0, 1.0, 5.0, 0.0, 0.0));
+        let mut buffer = TransformBuffer::new(10.0);
+        buffer
+            .insert(&link("world", "base", 0.0, world_from_base), true)
+            .unwrap();
+        buffer
+            .insert(&link("/base", "/camera", 0.0, base_from_camera), true)
+            .unwrap();
+        buffer
+            .insert(&link("map", "world", 0.0, map_from_world), true)
+            .unwrap();
+        let found = buffer.lookup("world", "camera", at(99.0)).unwrap();
+        assert!(distance(&found, &(world_from_base * base_from_camera)) < 1e-12);
+        let found = buffer.lookup("world", "map", at(99.0)).unwrap();
+        assert!(distance(&found, &map_from_world.inverse()) < 1e-12);
+        let found = buffer.lookup("camera", "map", at(99.0)).unwrap();
+        let camera_from_map = (map_from_world * world_from_base * base_from_camera).inverse();
+        assert!(distance(&found, &camera_from_map) < 1e-12);
+    }
+
+    #[test]
+    fn a_constant_twist_is_interpolated_in_rotation_and_position() {
+        let pose = |t: f64| {
+            let rotation = UnitQuaternion::from_scaled_axis(Vector3::new(0.3, -0.4, 1.2) * t);
+            Pose::from_quaternion(&rotation, Vector3::new(1.0, -2.0, 0.5) * t)
+        };
+        let mut buffer = TransformBuffer::new(10.0);
+        for stamp_s in [0.0, 2.0, 1.0] {
+            buffer
+                .insert(&link("world", "tool", stamp_s, pose(stamp_s)), false)
+                .unwrap();
+        }
+        for stamp_s in [0.0, 0.25, 1.0, 1.9, 2.0] {
+            let found = buffer.lookup("world", "tool", at(stamp_s)).unwrap();
+            assert!(distance(&found, &pose(stamp_s)) < 1e-9, "{stamp_s}");
+        }
+    }
+
+    #[test]
+    fn nothing_is_extrapolated_and_nothing_is_assumed() {
+        let mut buffer = TransformBuffer::new(10.0);
+        let lookup = |buffer: &TransformBuffer, frame: &str, stamp_s| {
+            buffer
+                .lookup("world", frame, at(stamp_s))
+                .map_err(|error| (error.kind(), error.may_still_come()))
+        };
+        assert_eq!(lookup(&buffer, "world", 1.0), Ok(Pose::identity()));
+        assert_eq!(lookup(&buffer, "tool", 1.0), Err(("unknown_frame", true)));
+        buffer
+            .insert(&link("base", "tool", 1.0, Pose::identity()), false)
+            .unwrap();
+        assert_eq!(
+            lookup(&buffer, "tool", 1.0),
+            Err(("frame_not_connected", true))
+        );
+        assert_eq!(
+            lookup(&buffer, "base", 1.0),
+            Err(("frame_not_connected", true))
+        );
+        buffer
+            .insert(&link("world", "base", 0.0, Pose::identity()), true)
+            .unwrap();
+        assert_eq!(lookup(&buffer, "tool", 1.0), Ok(Pose::identity()));
+        assert_eq!(lookup(&buffer, "tool", 1.1), Err(("no_recent_tf", true)));
+        assert_eq!(lookup(&buffer, "tool", 0.9), Err(("older_than_tf", false)));
+        buffer
+            .insert(&link("base", "tool", 11.5, Pose::identity()), false)
+            .unwrap();
+        assert_eq!(
+            lookup(&buffer, "tool", 1.1),
+            Err(("older_than_tf", false)),
+            "history is 10 s"
+        );
+    }
+
+    #[test]
+    fn what_is_no_transform_leaves_the_buffer_as_it_was() {
+        let mut buffer = TransformBuffer::new(10.0);
+        buffer
+            .insert(&link("world", "a", 20.0, Pose::identity()), false)
+            .unwrap();
+        buffer
+            .insert(&link("a", "b", 0.0, Pose::identity()), true)
+            .unwrap();
+        let mut refused =
+            |transform: TransformStamped| buffer.insert(&transform, false).unwrap_err().kind();
+        assert_eq!(refused(link("b", "world", 0.0, Pose::identity())), "ring");
+        assert_eq!(refused(link("a", "a", 0.0, Pose::identity())), "ring");
+        assert_eq!(
+            refused(link("", "a", 0.0, Pose::identity())),
+            "empty_frame_name"
+        );
+        assert_eq!(
+            refused(link("world", "a", 20.0, Pose::identity())),
+            "repeated_or_old"
+        );
+        assert_eq!(
+            refused(link("world", "a", 9.9, Pose::identity())),
+            "repeated_or_old"
+        );
+        let mut bad = link("world", "a", 21.0, Pose::identity());
+        bad.transform.rotation.w = 0.0;
+        assert_eq!(refused(bad.clone()), "bad_quaternion");
+        bad.transform.translation.y = f64::NAN;
+        assert_eq!(refused(bad), "not_finite");
+        assert_eq!(buffer.lookup("world", "b", at(20.0)), Ok(Pose::identity()));
+    }
+}

@@ -113,7 +113,7 @@ pub enum Input {
     /// What a tool did.
     Wrench(AppliedWrench),
     /// Where a part was measured to be.
-    Pose(MeasuredPose),
+    Pose(Box<MeasuredPose>),
 }
 
 impl Input {

@@ -267,8 +267,11 @@ impl Bag {
             }
             self.segments.pop_front();
             self.bytes_read += segment.length;
-            if let Err(kind) = self.read_segment(file, &segment) {
-                self.report(file, segment.offset, kind);
+            match self.read_segment(file, &segment) {
+                // Where the file was cut is reported already.
+                Err(_) if segment.kind == SegmentKind::CutChunk => {}
+                Err(kind) => self.report(file, segment.offset, kind),
+                Ok(()) => {}
             }
         }
     }
@@ -283,12 +286,7 @@ impl Bag {
             bytes: &chunk,
             position: 0,
         }) {
-            let (opcode, range) = match record {
-                Ok(record) => record,
-                // Where the file was cut is reported already.
-                Err(_) if segment.kind == SegmentKind::CutChunk => break,
-                Err(kind) => return Err(kind),
-            };
+            let (opcode, range) = record?;
             let body = chunk.get(range.clone()).unwrap_or_default();
             if opcode != op::MESSAGE {
                 file.channels.declare(opcode, body)?;

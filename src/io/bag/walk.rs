@@ -5,7 +5,7 @@
 //! Where the row of records breaks, the summary's chunk index says where it goes on.
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, BTreeSet},
     fs::File,
     io::{self, BufReader, Read, Seek, SeekFrom},
     sync::Arc,
@@ -97,28 +97,53 @@ pub(super) fn map_file(file: &File) -> io::Result<Option<FileMap>> {
     } {
         return Ok(None);
     }
-    let summary = read_summary(&mut reader, length).unwrap_or_default();
+    let summary = read_summary(&mut reader, length);
+    let has_end = summary.is_some();
+    let summary = summary.unwrap_or_default();
     let mut map = FileMap {
         channels: summary.channels,
         counts: summary.counts,
         ..FileMap::default()
     };
-    let mut position = MAGIC.len() as u64;
-    while let Err(broken_at) = walk(&mut reader, position, length, &mut map)? {
-        // One byte on at least, so that this ends.
-        match summary
-            .chunk_offsets
-            .iter()
-            .find(|offset| **offset > broken_at)
-        {
-            Some(offset) => position = *offset,
-            None => break,
-        }
-    }
+    let is_whole = walk(&mut reader, length, has_end, &mut map)?;
+    add_indexed_chunks(&mut map.segments, &summary.chunks, length, is_whole);
     if map.counts.is_empty() {
         count_messages(file, &mut map)?;
     }
     Ok(Some(map))
+}
+
+/// Adds the chunks that the summary knows of and the walk did not find, as a broken record hides
+/// those after it. Where the walk broke off, its last find may be what was broken.
+fn add_indexed_chunks(
+    segments: &mut Vec<Segment>,
+    chunks: &[Segment],
+    length: u64,
+    is_whole: bool,
+) {
+    let fits = |chunk: &&Segment| {
+        chunk
+            .offset
+            .checked_add(chunk.length)
+            .is_some_and(|end| end <= length)
+    };
+    if !is_whole {
+        let last_is_indexed = |last: &mut Segment| {
+            last.kind != SegmentKind::Loose
+                && chunks
+                    .iter()
+                    .filter(fits)
+                    .any(|chunk| chunk.offset == last.offset)
+        };
+        segments.pop_if(last_is_indexed);
+    }
+    let found: BTreeSet<u64> = segments.iter().map(|segment| segment.offset).collect();
+    segments.extend(
+        chunks
+            .iter()
+            .filter(fits)
+            .filter(|chunk| !found.contains(&chunk.offset)),
+    );
 }
 
 /// Reads a segment's bytes, decompressed: a row of records.
@@ -139,42 +164,45 @@ pub(super) fn read_segment(file: &mut File, segment: &Segment) -> Result<Vec<u8>
     }
 }
 
-/// Goes from record to record up to the end of the data section. The inner error is where the row
-/// of records breaks, which is then in `map.damage`.
+/// Goes from record to record up to the end of the data section. `false` if the row of records
+/// breaks before, which is then in `map.damage`. `has_end`: the file has its footer, so that a
+/// record beyond the end is a wrong length, not a truncated file.
 fn walk(
     reader: &mut BufReader<&File>,
-    from: u64,
     length: u64,
+    has_end: bool,
     map: &mut FileMap,
-) -> io::Result<Result<(), u64>> {
-    let mut position = from;
+) -> io::Result<bool> {
+    let mut position = MAGIC.len() as u64;
     let mut extends_loose = false;
     reader.seek(SeekFrom::Start(position))?;
     loop {
-        let mut broken = |kind| {
-            map.damage.push((position, kind));
-            Ok(Err(position))
-        };
         let mut bytes = [0; PREFIX];
         if length - position < PREFIX as u64 {
-            return broken(DamageKind::Truncated);
+            map.damage.push((position, DamageKind::Truncated));
+            return Ok(false);
         }
         reader.read_exact(&mut bytes)?;
         let (opcode, body_length) = records::prefix(&bytes);
-        if opcode == 0 || (opcode > op::LAST && opcode < op::PRIVATE) {
-            return broken(DamageKind::LostRecords {
-                opcode,
-                length: body_length,
-            });
-        }
         if matches!(opcode, op::DATA_END | op::FOOTER) {
-            return Ok(Ok(()));
+            return Ok(true);
         }
-        let available = length - position - PREFIX as u64;
-        let is_cut = body_length > available;
         let begin = position + PREFIX as u64;
-        if is_cut && opcode != op::CHUNK {
-            return broken(DamageKind::Truncated);
+        let available = length - begin;
+        let is_cut = body_length > available;
+        let is_record = opcode != 0 && (opcode <= op::LAST || opcode >= op::PRIVATE);
+        if is_cut || !is_record {
+            let kind = match is_record && !has_end {
+                true => DamageKind::Truncated,
+                false => DamageKind::LostRecords {
+                    opcode,
+                    length: body_length,
+                },
+            };
+            map.damage.push((position, kind));
+            if opcode != op::CHUNK {
+                return Ok(false);
+            }
         }
         let head_length = body_length.min(available);
         let read = match opcode {
@@ -224,9 +252,7 @@ fn walk(
                     });
                 }
                 if is_cut {
-                    // The length itself may be what is wrong: then the next chunk lies further on.
-                    map.damage.push((position, DamageKind::Truncated));
-                    return Ok(Err(position));
+                    return Ok(false);
                 }
             }
             _ => {}
@@ -241,8 +267,8 @@ fn walk(
 struct Summary {
     channels: Channels,
     counts: BTreeMap<u16, u64>,
-    /// Where chunk records begin, in order.
-    chunk_offsets: Vec<u64>,
+    /// The chunk index.
+    chunks: Vec<Segment>,
 }
 
 /// The summary section, if the file ends as it should and the section is consistent.
@@ -277,14 +303,21 @@ fn read_summary(reader: &mut BufReader<&File>, length: u64) -> Option<Summary> {
             op::SCHEMA | op::CHANNEL => summary.channels.declare(opcode, body).ok()?,
             op::CHUNK_INDEX => {
                 let mut fields = Fields(body);
-                fields.bytes(16)?;
-                summary.chunk_offsets.push(fields.u64()?);
+                let (start, _end) = (fields.u64()?, fields.u64()?);
+                let offset = fields.u64()?.checked_add(PREFIX as u64)?;
+                let length = fields.u64()?.checked_sub(PREFIX as u64)?;
+                summary.chunks.push(Segment {
+                    kind: SegmentKind::Chunk,
+                    offset,
+                    length,
+                    start,
+                });
             }
             op::STATISTICS => {
                 let mut fields = Fields(body);
                 // Message, schema, channel, attachment, metadata and chunk counts, start and end.
                 fields.bytes(8 + 2 + 4 + 4 + 4 + 4 + 8 + 8)?;
-                let mut counts = Fields(fields.bytes(4).and_then(|_| Some(fields.0))?);
+                let mut counts = Fields(fields.bytes(4).map(|_| fields.0)?);
                 while let (Some(channel), Some(count)) = (counts.u16(), counts.u64()) {
                     summary.counts.insert(channel, count);
                 }
@@ -292,7 +325,6 @@ fn read_summary(reader: &mut BufReader<&File>, length: u64) -> Option<Summary> {
             _ => {}
         }
     }
-    summary.chunk_offsets.sort_unstable();
     Some(summary)
 }
 
