@@ -1,7 +1,11 @@
-//! Chains against MuJoCo: the fixture is written by `mujoco_peer/trajectories.py`.
+//! Chains against MuJoCo: within 1 mm or 1 mrad over 4 s, with steps up to 2 ms.
+//!
+//! The fixture is written by `mujoco_peer/trajectories.py`.
 //!
 //! With `BOM_PEER_PYTHON` set to a Python that has `mujoco_peer/requirements.txt`, the reference is
-//! simulated anew.
+//! simulated anew. With `BOM_PEER_TABLE` set to a path, the errors are written there.
+
+#![allow(clippy::unwrap_used, reason = "a test")]
 
 use std::fmt::Write;
 use std::path::Path;
@@ -133,10 +137,10 @@ fn chains_move_as_in_mujoco() {
             write!(table, " {:.1} ms: {error:.3}", 1e3 * step_s).unwrap();
         }
         writeln!(table).unwrap();
-        failed |= errors[1].is_nan() || errors[1] >= 1.0;
+        failed |= errors[..3].iter().any(|error| error.is_nan() || *error >= 1.0);
+    }
+    if let Some(path) = std::env::var_os("BOM_PEER_TABLE") {
+        std::fs::write(path, &table).unwrap();
     }
     assert!(!failed, "{table}");
-    if std::env::var_os("BOM_PEER_TABLE").is_some() {
-        std::fs::write(std::env::temp_dir().join("bom_mujoco_errors.txt"), table).unwrap();
-    }
 }

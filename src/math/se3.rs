@@ -84,7 +84,7 @@ impl<T: Real> Pose<T> {
 impl Pose<f64> {
     /// The twist (angular \[rad\], linear \[m\]) whose exponential this is, |angular| ≤ π.
     pub fn log(&self) -> Vector6<f64> {
-        let omega = Rotation3::from_matrix_unchecked(self.rotation).scaled_axis();
+        let omega = rotation_vector(&self.rotation);
         let theta = omega.norm();
         let k = skew(&omega);
         let coefficient = if theta < 1e-4 {
@@ -165,6 +165,23 @@ fn stack<T: Real>(angular: &Vector3<T>, linear: &Vector3<T>) -> Vector6<T> {
     Vector6::new(angular.x, angular.y, angular.z, linear.x, linear.y, linear.z)
 }
 
+/// The rotation vector of R, |ω| ≤ π: from the antisymmetric part, which keeps its digits near zero.
+fn rotation_vector(rotation: &Matrix3<f64>) -> Vector3<f64> {
+    let sine = 0.5
+        * Vector3::new(
+            rotation[(2, 1)] - rotation[(1, 2)],
+            rotation[(0, 2)] - rotation[(2, 0)],
+            rotation[(1, 0)] - rotation[(0, 1)],
+        );
+    let cosine = 0.5 * (rotation.trace() - 1.0);
+    let length = sine.norm();
+    let angle = length.atan2(cosine);
+    if cosine < -0.9 {
+        return Rotation3::from_matrix_unchecked(*rotation).scaled_axis();
+    }
+    if length < 1e-9 { sine } else { sine * (angle / length) }
+}
+
 /// sin θ/θ, (1 − cos θ)/θ² and (θ − sin θ)/θ³ from θ², by series near zero.
 fn exponential_coefficients<T: Real>(theta_squared: T) -> (T, T, T) {
     if theta_squared.value() < 1e-4 {
@@ -218,6 +235,12 @@ mod tests {
         let screw = Screw::revolute(&Vector3::z(), &point);
         let moved = screw.displacement(0.7).transform_point(&(point + Vector3::z()));
         assert!((moved - point - Vector3::z()).norm() < 1e-14);
+    }
+
+    #[test]
+    fn log_keeps_its_digits_near_zero() {
+        let twist = Vector6::new(1e-7, -2e-7, 3e-7, 1e-3, 0.0, 0.0);
+        assert!((Pose::exp(&twist).log() - twist).norm() < 1e-15);
     }
 
     #[test]

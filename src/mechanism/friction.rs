@@ -1,17 +1,10 @@
-//! Coulomb friction and limits by their exact proximal step.
+//! Coulomb friction and limits of one joint, by their exact proximal step.
 //!
-//! The rates v after a step solve A v = b + λ with λ_j in the friction interval, opposed to the
-//! motion, and v_j within its bounds. They are the minimum of the strictly convex
-//!
-//! ½ vᵀ A v − bᵀ v + Σ_j (f⁺_j max(v_j, 0) + f⁻_j max(−v_j, 0)),  l_j ≤ v_j ≤ u_j
-//!
-//! (Moreau 1988; Acary, Brogliato, "Numerical Methods for Nonsmooth Dynamical Systems", 2008).
-//! Gauss–Seidel sweeps on values, and Newton steps cut short where a joint would change its regime,
-//! find which joints stick, slip or rest on a limit: each lowers the objective, so they end. The
-//! linear system of the slipping joints is then solved exactly, with its derivatives.
-//!
-//! A joint that turns round within the step met friction from both sides in turn. Taking only the
-//! last would cost an order of accuracy at every reversal, so its friction is shared by time.
+//! The rate v after a step solves a v = b + λ, λ in the friction interval and opposed to v, v within
+//! the bounds of the limits: the soft threshold of b, clamped (Moreau 1988; Acary, Brogliato,
+//! "Numerical Methods for Nonsmooth Dynamical Systems", 2008). A joint that turns round within the
+//! step met friction from both sides in turn. Taking only the last would cost an order of accuracy
+//! at every reversal, so its friction is shared by time.
 
 use super::limits::LimitFlow;
 use crate::math::Real;
@@ -65,15 +58,15 @@ impl<T: Real> Row<T> {
     /// The rate after the step of one joint alone, A = `a` and b = `impulse`.
     #[inline]
     pub fn proximal(&self, a: T, impulse: T, before: T) -> T {
-        let mut rate = soft_threshold(impulse, &self.friction) / a;
-        if rate.value() * before.value() < 0.0 {
-            let unturned = if before.value() > 0.0 {
-                (impulse - self.friction.against_plus) / a
-            } else {
-                (impulse + self.friction.against_minus) / a
-            };
-            rate -= share_before_turning(before, unturned) * (rate - unturned);
-        }
+        let against_plus = (impulse - self.friction.against_plus) / a;
+        let against_minus = (impulse + self.friction.against_minus) / a;
+        let rate = if before.value() > 0.0 {
+            rate_after_turning(before, against_plus, against_minus)
+        } else if before.value() < 0.0 {
+            -rate_after_turning(-before, -against_minus, -against_plus)
+        } else {
+            soft_threshold(impulse, &self.friction) / a
+        };
         match (self.least, self.greatest) {
             (Some(least), _) if rate.value() < least.rate.value() => least.rate,
             (_, Some(greatest)) if rate.value() > greatest.rate.value() => greatest.rate,
@@ -89,7 +82,7 @@ impl<T: Real> Row<T> {
     }
 
     /// The minimum of the one-dimensional problem, on values, with the regime that it is in.
-    fn proximal_value(&self, a: f64, impulse: f64) -> (f64, Regime) {
+    pub fn proximal_value(&self, a: f64, impulse: f64) -> (f64, Regime) {
         let plus = self.friction.against_plus.value();
         let minus = self.friction.against_minus.value();
         let (rate, regime) = if impulse > plus {
@@ -110,7 +103,7 @@ impl<T: Real> Row<T> {
     }
 
     /// l and u, infinite where no limit acts.
-    fn range(&self) -> (f64, f64) {
+    pub fn range(&self) -> (f64, f64) {
         (
             self.least.map_or(f64::NEG_INFINITY, |flow| flow.rate.value()),
             self.greatest.map_or(f64::INFINITY, |flow| flow.rate.value()),
@@ -118,15 +111,30 @@ impl<T: Real> Row<T> {
     }
 }
 
+/// The rate of one joint after a step from `before` > 0 that would end at `unturned` under the
+/// friction of positive motion, at `turned` under that of negative motion: if it comes to rest on
+/// the way, it stays there or turns round, as the other forces have it.
+#[inline]
+fn rate_after_turning<T: Real>(before: T, unturned: T, turned: T) -> T {
+    if unturned.value() >= 0.0 {
+        unturned
+    } else if turned.value() < before.value() {
+        turned - share_before_turning(before, unturned) * (turned - unturned)
+    } else {
+        T::zero()
+    }
+}
+
 /// The share of a step before a joint comes to rest that would have gone from the rate `before` to
 /// `unturned`, of the other sign, had friction not changed direction.
-fn share_before_turning<T: Real>(before: T, unturned: T) -> T {
+#[inline]
+pub(super) fn share_before_turning<T: Real>(before: T, unturned: T) -> T {
     before / (before - unturned)
 }
 
 /// Which piece of the set-valued law a joint is on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Regime {
+pub(super) enum Regime {
     SlipsPlus,
     SlipsMinus,
     Sticks,
@@ -134,168 +142,19 @@ enum Regime {
     AtGreatest,
 }
 
-/// Scratch of [`solve`], reused between steps.
-#[derive(Clone, Debug)]
-pub(super) struct SolveScratch<T: Real> {
-    regimes: Vec<Regime>,
-    values: Vec<f64>,
-    before: Vec<T>,
-    slipping: Vec<usize>,
-    factor: Vec<T>,
-    right: Vec<T>,
-}
-
-impl<T: Real> SolveScratch<T> {
-    pub fn new(n: usize) -> Self {
-        Self {
-            regimes: Vec::with_capacity(n),
-            values: vec![0.0; n],
-            before: Vec::with_capacity(n),
-            slipping: Vec::with_capacity(n),
-            factor: vec![T::zero(); n * n],
-            right: vec![T::zero(); n],
-        }
-    }
-}
-
-/// Rounds of sweeps and Newton step before the last guess is taken; enough for random problems of
-/// six joints and condition number 10⁴ (test `many_joints_meet_the_law`).
-const ROUNDS_MAX: usize = 100;
-/// Gauss–Seidel sweeps in a round.
-const SWEEPS: usize = 4;
-/// A proximal residual below this share of the impulses at play is rounding.
-const ROUNDING: f64 = 1e-13;
-
-/// Solves for the rates in place; on entry `rates` are those before the step. `a` is symmetric
-/// positive definite, row by row. `rows` are used up.
-pub(super) fn solve<T: Real>(
-    a: &[T],
-    b: &[T],
-    rows: &mut [Row<T>],
-    rates: &mut [T],
-    scratch: &mut SolveScratch<T>,
-) {
-    if let [row] = rows {
-        rates[0] = row.proximal(a[0], b[0], rates[0]);
-        return;
-    }
-    scratch.before.clear();
-    scratch.before.extend_from_slice(rates);
-    find_regimes(a, b, rows, rates, scratch);
-    share_friction_of_turning(a, b, rows, rates, scratch);
-}
-
-fn find_regimes<T: Real>(
-    a: &[T],
-    b: &[T],
-    rows: &[Row<T>],
-    rates: &mut [T],
-    scratch: &mut SolveScratch<T>,
-) {
-    let n = rows.len();
-    // Joints go on as they did: most steps need no search.
-    scratch.regimes.clear();
-    scratch.regimes.extend(rows.iter().zip(&*rates).map(|(row, rate)| guess(row, rate.value())));
-    solve_regimes(a, b, rows, rates, scratch);
-    if is_settled(a, b, rows, rates, scratch) {
-        return;
-    }
-    for ((value, before), row) in scratch.values.iter_mut().zip(&scratch.before).zip(rows) {
-        let (least, greatest) = row.range();
-        *value = before.value().max(least).min(greatest);
-    }
-    for _ in 0..ROUNDS_MAX {
-        for j in (0..SWEEPS).flat_map(|_| 0..n) {
-            let (impulse, _) = impulse_on(j, n, a, b, |k| scratch.values[k]);
-            let (value, regime) = rows[j].proximal_value(a[j * n + j].value(), impulse);
-            scratch.values[j] = value;
-            scratch.regimes[j] = regime;
-        }
-        solve_regimes(a, b, rows, rates, scratch);
-        if is_settled(a, b, rows, rates, scratch) {
-            return;
-        }
-        go_towards(rows, rates, scratch);
-    }
-}
-
-/// Moves the values towards the solution of the present regimes, as far as all stay in theirs.
-fn go_towards<T: Real>(rows: &[Row<T>], target: &[T], scratch: &mut SolveScratch<T>) {
-    let SolveScratch { regimes, values, .. } = scratch;
-    let mut share = 1.0;
-    let mut blocked = None;
-    for (j, row) in rows.iter().enumerate() {
-        let (least, greatest) = row.range();
-        let (low, high) = match regimes[j] {
-            Regime::SlipsPlus => (least.max(0.0), greatest),
-            Regime::SlipsMinus => (least, greatest.min(0.0)),
-            _ => continue,
-        };
-        let (from, to) = (values[j], target[j].value());
-        let edge = if to < low {
-            low
-        } else if to > high {
-            high
-        } else {
-            continue;
-        };
-        let here = (edge - from) / (to - from);
-        if here < share {
-            share = here.max(0.0);
-            blocked = Some((j, edge));
-        }
-    }
-    for (value, target) in values.iter_mut().zip(target) {
-        *value += share * (target.value() - *value);
-    }
-    if let Some((j, edge)) = blocked {
-        values[j] = edge;
-    }
-}
-
-/// For joints that turn round: friction of either direction, each for its share of the step.
-fn share_friction_of_turning<T: Real>(
-    a: &[T],
-    b: &[T],
-    rows: &mut [Row<T>],
-    rates: &mut [T],
-    scratch: &mut SolveScratch<T>,
-) {
-    let turns = |regime: Regime, before: f64| match regime {
-        Regime::SlipsPlus => before < 0.0,
-        Regime::SlipsMinus => before > 0.0,
-        _ => false,
-    };
-    let n = rows.len();
-    if !(0..n).any(|j| turns(scratch.regimes[j], scratch.before[j].value())) {
-        return;
-    }
-    for j in 0..n {
-        if turns(scratch.regimes[j], scratch.before[j].value()) {
-            scratch.regimes[j] = scratch.regimes[j].reversed();
-        }
-    }
-    solve_regimes(a, b, rows, rates, scratch);
-    for j in 0..n {
-        let before = scratch.before[j];
-        if matches!(scratch.regimes[j], Regime::SlipsPlus | Regime::SlipsMinus)
-            && rates[j].value() * before.value() < 0.0
-        {
-            let share = share_before_turning(before, rates[j]);
-            let FrictionBounds { against_plus, against_minus } = rows[j].friction;
-            let sum = (against_plus + against_minus) * share;
-            rows[j].friction = FrictionBounds {
-                against_plus: against_plus - sum,
-                against_minus: against_minus - sum,
-            };
-            scratch.regimes[j] = scratch.regimes[j].reversed();
-        }
-    }
-    solve_regimes(a, b, rows, rates, scratch);
-}
-
 impl Regime {
-    fn reversed(self) -> Self {
+    /// The slip opposed to a rate; sticking, for none.
+    pub fn turned_from(before: f64) -> Self {
+        if before > 0.0 {
+            Self::SlipsMinus
+        } else if before < 0.0 {
+            Self::SlipsPlus
+        } else {
+            Self::Sticks
+        }
+    }
+
+    pub fn reversed(self) -> Self {
         match self {
             Self::SlipsPlus => Self::SlipsMinus,
             Self::SlipsMinus => Self::SlipsPlus,
@@ -304,171 +163,9 @@ impl Regime {
     }
 }
 
-fn guess<T: Real>(row: &Row<T>, rate: f64) -> Regime {
-    let (least, greatest) = row.range();
-    if rate <= least {
-        Regime::AtLeast
-    } else if rate >= greatest {
-        Regime::AtGreatest
-    } else if rate > 0.0 {
-        Regime::SlipsPlus
-    } else if rate < 0.0 {
-        Regime::SlipsMinus
-    } else {
-        Regime::Sticks
-    }
-}
-
-/// b_j − Σ_{k ≠ j} A_jk v_k and the size of its terms.
-fn impulse_on<T: Real>(
-    j: usize,
-    n: usize,
-    a: &[T],
-    b: &[T],
-    rate: impl Fn(usize) -> f64,
-) -> (f64, f64) {
-    let mut impulse = b[j].value();
-    let mut size = impulse.abs();
-    for k in (0..n).filter(|&k| k != j) {
-        let term = a[j * n + k].value() * rate(k);
-        impulse -= term;
-        size += term.abs();
-    }
-    (impulse, size)
-}
-
-/// Whether every joint's rate is what its own law gives under all the others.
-fn is_settled<T: Real>(
-    a: &[T],
-    b: &[T],
-    rows: &[Row<T>],
-    rates: &[T],
-    scratch: &SolveScratch<T>,
-) -> bool {
-    let n = rows.len();
-    (0..n).all(|j| {
-        let diagonal = a[j * n + j].value();
-        let (impulse, size) = impulse_on(j, n, a, b, |k| rates[k].value());
-        let (value, regime) = rows[j].proximal_value(diagonal, impulse);
-        regime == scratch.regimes[j]
-            || (value - rates[j].value()).abs() * diagonal <= ROUNDING * size
-    })
-}
-
-/// The rates if the regimes are right: fixed for stuck and limited joints, linear for the others.
-fn solve_regimes<T: Real>(
-    a: &[T],
-    b: &[T],
-    rows: &[Row<T>],
-    rates: &mut [T],
-    scratch: &mut SolveScratch<T>,
-) {
-    let n = rows.len();
-    let SolveScratch { regimes, slipping, factor, right, .. } = scratch;
-    slipping.clear();
-    for j in 0..n {
-        rates[j] = match regimes[j] {
-            Regime::SlipsPlus | Regime::SlipsMinus => {
-                slipping.push(j);
-                T::zero()
-            }
-            Regime::Sticks => T::zero(),
-            Regime::AtLeast => rows[j].least.map_or_else(T::zero, |flow| flow.rate),
-            Regime::AtGreatest => rows[j].greatest.map_or_else(T::zero, |flow| flow.rate),
-        };
-    }
-    let m = slipping.len();
-    for (i, &j) in slipping.iter().enumerate() {
-        let friction = match regimes[j] {
-            Regime::SlipsPlus => -rows[j].friction.against_plus,
-            _ => rows[j].friction.against_minus,
-        };
-        right[i] = b[j] + friction;
-        for k in (0..n).filter(|&k| matches!(regimes[k], Regime::AtLeast | Regime::AtGreatest)) {
-            right[i] -= a[j * n + k] * rates[k];
-        }
-        for (l, &k) in slipping.iter().enumerate().take(i + 1) {
-            factor[i * m + l] = a[j * n + k];
-        }
-    }
-    solve_symmetric(factor, right, m);
-    for (i, &j) in slipping.iter().enumerate() {
-        rates[j] = right[i];
-    }
-}
-
-/// Solves G x = r in place by L D Lᵀ; the lower triangle of G, row by row, is overwritten.
-fn solve_symmetric<T: Real>(g: &mut [T], r: &mut [T], n: usize) {
-    for i in 0..n {
-        for j in 0..i {
-            let mut sum = g[i * n + j];
-            for k in 0..j {
-                sum -= g[i * n + k] * g[j * n + k] * g[k * n + k];
-            }
-            g[i * n + j] = sum / g[j * n + j];
-        }
-        let mut pivot = g[i * n + i];
-        for k in 0..i {
-            pivot -= g[i * n + k] * g[i * n + k] * g[k * n + k];
-        }
-        g[i * n + i] = pivot;
-    }
-    for i in 0..n {
-        for k in 0..i {
-            let term = g[i * n + k] * r[k];
-            r[i] -= term;
-        }
-    }
-    for i in (0..n).rev() {
-        r[i] /= g[i * n + i];
-        for k in i + 1..n {
-            let term = g[k * n + i] * r[k];
-            r[i] -= term;
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nalgebra::DMatrix;
-    use proptest::prelude::*;
-
-    fn row(friction: f64, least: Option<f64>, greatest: Option<f64>) -> Row<f64> {
-        let flow = |rate| LimitFlow { rate, position: 0.0 };
-        Row {
-            friction: FrictionBounds::symmetric(friction),
-            least: least.map(flow),
-            greatest: greatest.map(flow),
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn many_joints_meet_the_law(
-            n in 1_usize..=6,
-            entries in prop::collection::vec(-1.0..1.0_f64, 36),
-            b in prop::collection::vec(-3.0..3.0_f64, 6),
-            friction in prop::collection::vec(0.0..2.0_f64, 6),
-            start in prop::collection::vec(-1.0..1.0_f64, 6),
-            limited in prop::collection::vec(any::<bool>(), 6),
-        ) {
-            let square = DMatrix::from_fn(n, n, |i, j| entries[6 * i + j]);
-            let a = &square * square.transpose() + DMatrix::identity(n, n) * 1e-3;
-            let rows: Vec<_> = (0..n)
-                .map(|j| row(friction[j], limited[j].then_some(-0.2), limited[5 - j].then_some(0.3)))
-                .collect();
-            let mut rates = start[..n].to_vec();
-            let mut scratch = SolveScratch::new(n);
-            scratch.before.extend_from_slice(&rates);
-            find_regimes(a.as_slice(), &b[..n], &rows, &mut rates, &mut scratch);
-            for j in 0..n {
-                let (impulse, size) = impulse_on(j, n, a.as_slice(), &b, |k| rates[k]);
-                let (wanted, _) = rows[j].proximal_value(a[(j, j)], impulse);
-                prop_assert!(((wanted - rates[j]) * a[(j, j)]).abs() <= 1e-12 * (1.0 + size));
-            }
-        }
-    }
 
     #[test]
     fn friction_takes_what_it_can() {
@@ -477,27 +174,5 @@ mod tests {
         assert_eq!(soft_threshold(2.5, &friction), 0.5);
         assert_eq!(soft_threshold(-1.5, &friction), -0.5);
         assert_eq!(soft_threshold(-1.5, &friction.reversed()), 0.0);
-    }
-
-    #[test]
-    fn a_stuck_joint_holds_still_exactly() {
-        let a = [2.0, 0.7, 0.7, 1.0];
-        let mut rates = [0.0, 0.1];
-        let mut rows = [row(5.0, None, None), row(0.1, None, None)];
-        solve(&a, &[0.5, 1.0], &mut rows, &mut rates, &mut SolveScratch::new(2));
-        assert_eq!(rates[0], 0.0);
-        assert!((rates[1] - 0.9).abs() < 1e-15);
-    }
-    #[test]
-    fn turning_round_splits_the_step_at_rest() {
-        // Mass 2, pushed with −6 against friction 1: from .005 to rest at −3.5, then on at −2.5.
-        let exact = -2.5 * (0.01 - 0.005 / 3.5);
-        let alone = row(0.01, None, None).proximal(2.0, 2.0 * 0.005 - 0.06, 0.005);
-        assert!((alone - exact).abs() < 1e-15);
-        let mut rates = [0.005, 0.0];
-        let mut rows = [row(0.01, None, None), row(0.0, None, None)];
-        let a = [2.0, 0.0, 0.0, 1.0];
-        solve(&a, &[2.0 * 0.005 - 0.06, 0.0], &mut rows, &mut rates, &mut SolveScratch::new(2));
-        assert!((rates[0] - exact).abs() < 1e-15);
     }
 }

@@ -16,6 +16,7 @@ mod limits;
 mod parameters;
 mod rollout;
 mod single;
+mod solve;
 mod step;
 #[cfg(test)]
 mod tests;

@@ -11,10 +11,11 @@
 //! q̇⁺ alone, so a stuck joint stays where it is, exactly.
 
 use super::effects::JointState;
-use super::friction::{FrictionBounds, Row, solve};
+use super::friction::{FrictionBounds, Row};
 use super::inertia::Spatial;
 use super::limits::Approach;
 use super::parameters::{JointForces, JointParameters};
+use super::solve::solve;
 use super::tree::Tree;
 use super::workspace::Workspace;
 use crate::math::Real;

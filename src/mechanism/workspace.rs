@@ -1,7 +1,8 @@
 //! Memory of the dynamics, kept between steps so that no step allocates.
 
-use super::friction::{Row, SolveScratch};
+use super::friction::Row;
 use super::inertia::{Spatial, SpatialInertia};
+use super::solve::SolveScratch;
 use super::tree::Tree;
 use crate::math::{Pose, Real};
 

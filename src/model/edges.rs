@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::Vector3;
 
-use super::kinematics::{AXIS_POINT_PRIOR, Axis, KinematicJoint, KinematicSettings, fit_kinematics};
+use super::kinematics::{Axis, KinematicJoint, KinematicSettings, fit_kinematics};
 use super::window::{Contact, PoseMeasurement, WindowObservations};
 use crate::math::{Pose, Screw, orthonormal_pair};
 use crate::mechanism::JointType;
@@ -22,6 +22,9 @@ pub const MOVE_COST: f64 = 3.0;
 const AXIS_DIRECTION_PRIOR: f64 = 1.0;
 /// Frames of one scene are not independent looks: their evidence is raised to this power.
 const TEMPERATURE: f64 = 0.5;
+
+/// What a moving parent's own track adds to the tool's position seen from it \[m\].
+const PARENT_SIGMA: f64 = 0.002;
 
 /// A part as edges see it.
 #[derive(Clone, Copy, Debug)]
@@ -52,6 +55,8 @@ pub fn relative_windows(child: Label, track: Option<&[Vec<Pose>]>, windows: &[&W
         .enumerate()
         .map(|(w, window)| {
             let reference = |k: usize| track.map_or_else(Pose::identity, |t| t[w][k].inverse());
+            let moves = track.is_some_and(|t| t[w].windows(2).any(|pair| pair[0] != pair[1]));
+            let blur = if moves { PARENT_SIGMA } else { 0.0 };
             let poses = window.poses.get(&child).map(|poses| {
                 poses
                     .iter()
@@ -68,7 +73,7 @@ pub fn relative_windows(child: Label, track: Option<&[Vec<Pose>]>, windows: &[&W
                     .filter(|c| c.label == child)
                     .map(|c| Contact {
                         label: child,
-                        track: c.track.iter().map(|(k, x, s)| (*k, reference(*k).transform_point(x), *s)).collect(),
+                        track: c.track.iter().map(|(k, x, s)| (*k, reference(*k).transform_point(x), s.hypot(blur))).collect(),
                     })
                     .collect(),
                 wrenches: Vec::new(),
@@ -117,7 +122,8 @@ pub fn moving_evidence(
             let positions = windows.iter().map(|w| vec![start_positions(&joint, w)]).collect();
             let fit = fit_kinematics(vec![joint], positions, &references, settings);
             let parameters = joint.axis_parameters();
-            let priors = [AXIS_DIRECTION_PRIOR, AXIS_DIRECTION_PRIOR, AXIS_POINT_PRIOR, AXIS_POINT_PRIOR];
+            let width = joint.axis_point_prior();
+            let priors = [AXIS_DIRECTION_PRIOR, AXIS_DIRECTION_PRIOR, width, width];
             let volume: f64 = (0..parameters)
                 .map(|i| 0.5 * fit.covariance[(i, i)].max(1e-16).ln() - priors[i].ln())
                 .map(|x: f64| x.min(0.0))

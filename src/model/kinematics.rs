@@ -18,10 +18,6 @@ use crate::math::{Pose, Screw, orthonormal_pair};
 use crate::mechanism::JointType;
 use crate::types::Label;
 
-/// Standard deviation of a hinge's distance from its part's reference point, per direction \[m\]:
-/// furniture-sized parts turn about axes within a metre or so.
-pub const AXIS_POINT_PRIOR: f64 = 0.5;
-
 /// A joint axis in world at the reference configuration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Axis {
@@ -65,6 +61,12 @@ impl KinematicJoint {
             JointType::Prismatic => 2,
             JointType::Revolute => 4,
         }
+    }
+
+    /// Standard deviation of the axis's distance from the reference point, per direction \[m\]: a
+    /// hinge touches the part it carries.
+    pub fn axis_point_prior(&self) -> f64 {
+        2.0 * self.radius + 0.05
     }
 
     /// The axis's tangent twists: two rotations about its point, then two translations across it.
@@ -329,7 +331,7 @@ impl<'a> Problem<'a> {
     fn cost(&self) -> f64 {
         let mut cost = 0.5 * self.tool_offset.norm_squared() / self.settings.tool_offset_sigma.powi(2);
         for joint in self.joints.iter().filter(|j| j.joint_type == JointType::Revolute) {
-            cost += 0.5 * (joint.axis.point - joint.center).norm_squared() / AXIS_POINT_PRIOR.powi(2);
+            cost += 0.5 * (joint.axis.point - joint.center).norm_squared() / joint.axis_point_prior().powi(2);
         }
         for (w, window) in self.windows.iter().enumerate() {
             for frame in 0..window.times_s.len() {
@@ -446,7 +448,7 @@ impl<'a> Problem<'a> {
             let arm = joint.axis.point - joint.center;
             let (first, second) = orthonormal_pair(&joint.axis.direction);
             for (i, pull) in [0.0, 0.0, arm.dot(&first), arm.dot(&second)].into_iter().take(joint.axis_parameters()).enumerate() {
-                let information = if i < 2 { 1.0 } else { AXIS_POINT_PRIOR.powi(-2) };
+                let information = if i < 2 { 1.0 } else { joint.axis_point_prior().powi(-2) };
                 matrix[(at + i, at + i)] += information;
                 gradient[at + i] += information * pull;
             }

@@ -93,7 +93,9 @@ pub fn explain_window(scene: &Scene<'_>) -> BTreeMap<Label, Motion> {
             }
         }
         let Some((_, index, motion)) = best else { break };
-        motions.insert(open.remove(index), motion);
+        let label = open.remove(index);
+        let still = scene.evaluate(label, |_| scene.start_of(label));
+        motions.insert(label, if scene.beats(label, &motion, &still) { motion } else { still });
     }
     for label in open {
         motions.insert(label, scene.evaluate(label, |_| scene.start_of(label)));
@@ -146,36 +148,44 @@ impl Scene<'_> {
         (points.iter().map(|p| (p - mean).norm_squared()).sum::<f64>() / count).sqrt()
     }
 
+    /// Whether a motion explains a part clearly better than rest. A cost that stays high either way
+    /// is a new face coming into view, not motion.
+    fn beats(&self, label: Label, motion: &Motion, still: &Motion) -> bool {
+        let gain = still.excess - motion.excess;
+        let seen = gain > EXPLAINED && gain > 0.3 * still.excess;
+        let miss = self.tool_miss(label, &still.displacements);
+        let felt = miss > TOOL_EXPLAINED && self.tool_miss(label, &motion.displacements) < 0.5 * miss && gain > -0.2;
+        seen || felt
+    }
+
     fn best_motion(&self, label: Label, known: &BTreeMap<Label, Motion>) -> Option<Motion> {
         let model = &self.models[&label];
-        let mut best: Option<Motion> = None;
-        let mut best_score = f64::INFINITY;
-        let mut offer = |motion: Motion, complexity: f64| {
+        let mut best = Best { motion: None, score: f64::INFINITY };
+        let score = |motion: &Motion, complexity: f64| {
             let miss = self.tool_miss(label, &motion.displacements);
-            let score = motion.excess + complexity + 0.05 * (miss / TOOL_EXPLAINED).min(20.0);
-            if score < best_score {
-                best_score = score;
-                best = Some(motion);
-            }
-            best_score
+            motion.excess + complexity + 0.05 * (miss / TOOL_EXPLAINED).min(20.0)
         };
-        let mut reached = f64::INFINITY;
         // Along the joint that is known.
         if let Some(joint) = self.joints.iter().find(|joint| joint.child == label) {
             let parent = joint.parent.map(|p| self.joints[p].child);
             if let Some(parents) = self.parent_track(parent, known) {
                 let motion = self.along(label, &joint.screw(), joint.joint_type, &parents);
-                reached = offer(motion, 0.0);
+                best.offer(score(&motion, 0.0), motion);
             }
         }
         let movers: Vec<Label> = known.iter().filter(|(_, m)| m.moved).map(|(l, _)| *l).collect();
         for &carrier in &movers {
             let track = &known[&carrier].displacements;
             let fixed = track[0].inverse() * self.start_of(label);
-            reached = reached.min(offer(self.evaluate(label, |k| track[k] * fixed), 0.0));
+            let motion = self.evaluate(label, |k| track[k] * fixed);
+            best.offer(score(&motion, 0.0), motion);
         }
-        if reached < EXPLAINED {
-            return best;
+        let still = self.evaluate(label, |_| self.start_of(label));
+        if let Some(motion) = &best.motion {
+            let held = self.tool_miss(label, &motion.displacements) < 1.5 * TOOL_EXPLAINED;
+            if held && (motion.excess < EXPLAINED || motion.excess < 0.6 * still.excess) {
+                return best.motion;
+            }
         }
         let mut parents: Vec<Option<Label>> = vec![None];
         parents.extend(movers.iter().map(|l| Some(*l)));
@@ -185,14 +195,15 @@ impl Scene<'_> {
                 .filter(|(l, m)| !m.moved && travel(&self.models[*l], &Pose::identity(), &self.start_of(**l)) > 0.005)
                 .map(|(l, _)| Some(*l)),
         );
+        let most = if best.score < 2.0 * EXPLAINED { 2 } else { 5 };
         for (rank, parent) in parents.iter().enumerate() {
             let Some(track) = self.parent_track(*parent, known) else { continue };
-            for seed in self.seeds(label, model, &track, best_seed_count(reached)) {
+            for seed in self.seeds(label, model, &track, most) {
                 let Some(motion) = self.refine(label, *parent, &seed, &track) else { continue };
-                reached = reached.min(offer(motion, 0.02 + if rank > 0 { 0.02 } else { 0.0 }));
+                best.offer(score(&motion, 0.02 + if rank > 0 { 0.02 } else { 0.0 }), motion);
             }
         }
-        best
+        best.motion
     }
 
     /// Displacements of a parent through the window, if they are known.
@@ -325,6 +336,20 @@ impl Scene<'_> {
     }
 }
 
+/// The best of the motions offered so far.
+struct Best {
+    motion: Option<Motion>,
+    score: f64,
+}
+
+impl Best {
+    fn offer(&mut self, score: f64, motion: Motion) {
+        if score < self.score {
+            (self.score, self.motion) = (score, Some(motion));
+        }
+    }
+}
+
 /// A scan's pose near `predicted`: the Gauss–Newton optimum of what the scan holds, with its
 /// information; directions that nothing holds stay as predicted.
 pub fn measure(model: &PartModel, scan: &[ScanPoint], predicted: &Pose, settings: &AlignmentSettings) -> Option<PoseMeasurement> {
@@ -352,10 +377,6 @@ pub fn measurement_of(model: &PartModel, factor: &PoseFactor, predicted: &Pose) 
         * Pose::exp(&step)
         * Pose::from_translation(-model.centroid);
     PoseMeasurement { displacement, information }
-}
-
-fn best_seed_count(reached: f64) -> usize {
-    if reached < 2.0 * EXPLAINED { 2 } else { 5 }
 }
 
 fn seed_type(seed: &AxisSeed) -> JointType {

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::Vector3;
+use nalgebra::{DMatrix, Vector3};
 
 use super::explain::{Frame, Motion, Scene, explain_window, measure, travel};
 use crate::math::Pose;
@@ -12,6 +12,7 @@ use crate::model::{
     fit_kinematics, moving_evidence, relative_windows, rigid_evidence,
 };
 use crate::registration::{AlignmentSettings, PartModel, SurfelAccumulator, fit_circle, fit_line, truncated_cost};
+use crate::structure::TreeDistribution;
 use crate::types::{AppliedWrench, Label};
 
 /// A part moved if it ever travelled further than this \[m\].
@@ -131,14 +132,10 @@ impl Learner {
             self.tracks.entry(*label).or_default().push(motion.displacements.clone());
         }
         self.windows.push(observations);
-        for round in 0..2 {
-            self.weigh_edges(&motions);
-            self.fit_joints();
-            self.remeasure(job);
-            if round == 1 {
-                self.fit_joints();
-            }
-        }
+        self.weigh_edges(&motions);
+        self.fit_joints();
+        self.remeasure(job);
+        self.fit_joints();
         self.grow(job);
     }
 
@@ -174,6 +171,10 @@ impl Learner {
             parents.extend(movers.iter().filter(|l| **l != child).map(|l| Some(*l)));
             let mut options = Vec::new();
             for parent in parents {
+                if let Some(old) = self.unaffected(child, parent, motions) {
+                    options.push(old);
+                    continue;
+                }
                 let track = parent.map(|p| self.tracks[&p].as_slice());
                 let relative = relative_windows(child, track, &windows);
                 let rigid = rigid_evidence(&part, &relative, &self.settings);
@@ -193,6 +194,20 @@ impl Learner {
             evidence.insert(child, options);
         }
         self.evidence = evidence;
+    }
+
+    /// The evidence so far, where neither part moved in the window: it adds the same to every type.
+    fn unaffected(&self, child: Label, parent: Option<Label>, motions: &BTreeMap<Label, Motion>) -> Option<ParentEvidence> {
+        let moved = |label: Label| motions.get(&label).is_some_and(|m| m.moved);
+        if moved(child) || parent.is_some_and(moved) {
+            return None;
+        }
+        let mut old = self.evidence.get(&child)?.iter().find(|o| o.parent == parent)?.clone();
+        for fit in old.fits.iter_mut().flatten() {
+            let last = fit.positions.last().and_then(|w| w.last()).copied().unwrap_or(0.0);
+            fit.positions.push(vec![last; self.windows.last().map_or(0, |w| w.times_s.len())]);
+        }
+        Some(old)
     }
 
     fn start_axes(
@@ -234,34 +249,44 @@ impl Learner {
         starts
     }
 
-    /// The likeliest parent and type of each mover, as a tree with parents first.
-    fn likeliest(&self) -> Vec<(Label, Option<Label>, JointType, Axis)> {
-        let mut left: BTreeMap<Label, &Vec<ParentEvidence>> = self.evidence.iter().map(|(l, e)| (*l, e)).collect();
-        let mut order: Vec<(Label, Option<Label>, JointType, Axis)> = Vec::new();
-        while !left.is_empty() {
-            // Attach the part whose best parent is already in place, best evidence first.
-            let mut best: Option<(f64, Label, Option<Label>, JointType, Axis)> = None;
-            for (&child, options) in &left {
-                let top = options.iter().map(|o| o.log_evidence[1].max(o.log_evidence[2])).fold(f64::NEG_INFINITY, f64::max);
-                for option in options.iter() {
-                    let placed = option.parent.is_none_or(|p| order.iter().any(|(l, ..)| *l == p));
-                    if !placed {
-                        continue;
-                    }
-                    for joint_type in [JointType::Prismatic, JointType::Revolute] {
-                        let Some(fit) = &option.fits[joint_type as usize] else { continue };
-                        let regret = fit.log_evidence - top;
-                        if best.as_ref().is_none_or(|(b, ..)| regret > *b) {
-                            best = Some((regret, child, option.parent, joint_type, fit.joint.axis));
-                        }
-                    }
+    /// Log weights of the edges between what never moved (node 0) and the parts that did, in the
+    /// order of `evidence`: each the evidence summed over joint types.
+    fn edge_weights(&self) -> DMatrix<f64> {
+        let movers: Vec<Label> = self.evidence.keys().copied().collect();
+        let mut weights = DMatrix::from_element(movers.len() + 1, movers.len() + 1, f64::NEG_INFINITY);
+        for (column, options) in self.evidence.values().enumerate() {
+            for option in options {
+                let row = option.parent.map_or(Some(0), |p| movers.iter().position(|l| *l == p).map(|i| i + 1));
+                if let Some(row) = row {
+                    weights[(row, column + 1)] = log_mean_exp(&option.log_evidence);
                 }
             }
-            let Some((_, child, parent, joint_type, axis)) = best else { break };
-            order.push((child, parent, joint_type, axis));
-            left.remove(&child);
         }
-        order
+        weights
+    }
+
+    /// The likeliest parent and type of each mover, as a tree with parents first.
+    fn likeliest(&self) -> Vec<(Label, Option<Label>, JointType, Axis)> {
+        let movers: Vec<Label> = self.evidence.keys().copied().collect();
+        let tree = match TreeDistribution::new(&self.edge_weights()) {
+            Ok(distribution) => distribution.most_likely(),
+            Err(error) => {
+                tracing::warn!(%error, "no tree explains the parts");
+                return Vec::new();
+            }
+        };
+        tree.topological_order()
+            .into_iter()
+            .filter(|node| *node > 0)
+            .filter_map(|node| {
+                let child = movers[node - 1];
+                let parent = tree.parent(node).and_then(|p| p.checked_sub(1)).map(|p| movers[p]);
+                let option = self.evidence[&child].iter().find(|o| o.parent == parent)?;
+                let fits = [JointType::Prismatic, JointType::Revolute].map(|t| option.fits[t as usize].as_ref());
+                let fit = fits.into_iter().flatten().max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence))?;
+                Some((child, parent, fit.joint.joint_type, fit.joint.axis))
+            })
+            .collect()
     }
 
     /// Fits all joints of the likeliest tree to all windows.
@@ -342,4 +367,9 @@ impl Learner {
             }
         }
     }
+}
+
+fn log_mean_exp(values: &[f64]) -> f64 {
+    let top = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    top + (values.iter().map(|v| (v - top).exp()).sum::<f64>() / values.len() as f64).ln()
 }

@@ -86,7 +86,7 @@ impl SurfelAccumulator {
 
     /// The surfel model of everything added so far; `None` with fewer than `PLANE_SURFELS` surfels.
     pub fn build(&self) -> Option<PartModel> {
-        let least = (0.1 * self.scans as f64).clamp(1.0, 3.0);
+        let least = 1.0;
         let mut surfels = Vec::new();
         let mut sides: Vec<u8> = self.voxels.keys().map(|(side, _)| *side).collect();
         sides.dedup();
