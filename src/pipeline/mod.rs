@@ -2,6 +2,7 @@
 
 mod explain;
 mod learner;
+mod posterior;
 mod windows;
 
 use std::collections::BTreeMap;
@@ -13,7 +14,7 @@ pub use learner::{Learner, ParentEvidence, WindowJob};
 pub use windows::{FrameAssembler, WindowCutter, WindowSettings};
 
 use crate::math::Pose;
-use crate::model::PoseMeasurement;
+use crate::model::{KinematicSettings, PoseMeasurement};
 use crate::registration::{AlignmentSettings, SurfelAccumulator, align, truncated_cost};
 use crate::types::{Input, Label, Stamp};
 use explain::{FEWEST_POINTS, measurement_of, travel};
@@ -33,6 +34,8 @@ pub struct PipelineSettings {
     pub use_tool: bool,
     /// When windows open and close.
     pub windows: WindowSettings,
+    /// What is assumed of the pose measurements.
+    pub kinematics: KinematicSettings,
 }
 
 /// What the pipeline says.
@@ -160,6 +163,7 @@ impl Pipeline {
             accumulators.iter().max_by_key(|(_, a)| a.voxel_means(1.0).len()).map_or(Label(0), |(l, _)| *l)
         });
         let mut learner = Learner::new(root, self.settings.use_tool, accumulators);
+        learner.settings = self.settings.kinematics;
         learner.calibrate(&self.reference);
         self.reference.clear();
         self.learner = Some(learner);

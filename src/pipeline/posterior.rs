@@ -1,0 +1,184 @@
+//! The posterior as it is published: what the learner knows, over all trees.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use nalgebra::{DMatrix, Vector3};
+
+use super::{Learner, ParentEvidence, Pipeline};
+use crate::geometry::hull_properties;
+use crate::mechanism::JointType;
+use crate::model::Axis;
+use crate::structure::TreeDistribution;
+use crate::types::Label;
+use crate::types::posterior::{
+    Criticism, EdgePosterior, InformedBy, JointTypeProbabilities, ObjectPosterior, PartPosterior, PrismaticAxis,
+    Quantity, RevoluteAxis, WindowRecord,
+};
+
+/// Density of furniture parts over their hull, median \[kg/m³\] and standard deviation of its log:
+/// hollow drawers weigh 100, boards 600.
+const HULL_DENSITY: (f64, f64) = (250.0, 0.9);
+/// The centre of mass of a part lies this share of its spread away from its hull's, per axis.
+const CENTER_SHARE: f64 = 0.3;
+
+impl Pipeline {
+    /// What is believed now; before the first window, the prior. `None` while no part was seen.
+    pub fn posterior(&self) -> Option<ObjectPosterior> {
+        let points = self.points();
+        let root = match (&self.learner, self.settings.root) {
+            (Some(learner), _) => learner.root,
+            (None, Some(root)) => root,
+            (None, None) => points.iter().max_by_key(|(_, points)| points.len()).map(|(label, _)| *label)?,
+        };
+        let labels: Vec<Label> = points.keys().copied().collect();
+        Some(ObjectPosterior {
+            root_label: root,
+            parts: points.iter().filter_map(|(label, points)| part(*label, points)).collect(),
+            edges: edges(root, &labels, self.learner.as_ref()),
+            windows: self.learner.iter().flat_map(|learner| &learner.windows).map(window_record).collect(),
+            criticism: Criticism::insufficient(),
+        })
+    }
+
+    /// Points of each part's surface at the reference configuration \[m\].
+    fn points(&self) -> BTreeMap<Label, Vec<Vector3<f64>>> {
+        if let Some(learner) = &self.learner {
+            return learner.accumulators.iter().map(|(label, a)| (*label, a.voxel_means(1.0))).collect();
+        }
+        let mut points: BTreeMap<Label, Vec<Vector3<f64>>> = BTreeMap::new();
+        let last = self.reference.last().into_iter().flat_map(|frame| &frame.scans);
+        for (label, scan) in last {
+            points.entry(*label).or_default().extend(scan.iter().map(|p| p.point_in_world));
+        }
+        points
+    }
+}
+
+fn part(label: Label, points: &[Vector3<f64>]) -> Option<PartPosterior> {
+    let hull = hull_properties(points, None)?;
+    let mut covariance = [[0.0; 3]; 3];
+    for (axis, row) in covariance.iter_mut().enumerate() {
+        row[axis] = (CENTER_SHARE * hull.spread[axis]).powi(2) + 1e-6;
+    }
+    let (density, log_sd) = HULL_DENSITY;
+    Some(PartPosterior {
+        label,
+        com_in_world_m: hull.center.into(),
+        com_covariance_m2: covariance,
+        mass_kg: Quantity::from_log_normal("kg", (density * hull.volume).ln(), log_sd, InformedBy::Prior),
+    })
+}
+
+fn window_record(window: &crate::model::WindowObservations) -> WindowRecord {
+    let touched: BTreeSet<Label> = window.contacts.iter().map(|contact| contact.label).collect();
+    let end = |time: Option<&f64>| time.copied().unwrap_or_default();
+    WindowRecord {
+        t0_s: end(window.times_s.first()),
+        t1_s: end(window.times_s.last()),
+        labels: touched.into_iter().collect(),
+        frames: window.times_s.len(),
+        steps: 0,
+        inference_wall_s: 0.0,
+        elbo: None,
+        log_predictive_density: None,
+    }
+}
+
+fn edges(root: Label, labels: &[Label], learner: Option<&Learner>) -> Vec<EdgePosterior> {
+    let nodes: Vec<Label> = [root].into_iter().chain(labels.iter().copied().filter(|l| *l != root)).collect();
+    let evidence = |child: Label| learner.and_then(|l| l.evidence.get(&child));
+    let mut log_weights = DMatrix::zeros(nodes.len(), nodes.len());
+    for (j, child) in nodes.iter().enumerate().skip(1) {
+        let Some(options) = evidence(*child) else { continue };
+        for (i, parent) in nodes.iter().enumerate() {
+            let moved = evidence(*parent).is_some();
+            log_weights[(i, j)] =
+                option_for(options, *parent, moved).map_or(f64::NEG_INFINITY, |o| log_sum(&o.log_evidence));
+        }
+    }
+    let Ok(trees) = TreeDistribution::new(&log_weights) else { return Vec::new() };
+    let mut found = Vec::new();
+    for (j, child) in nodes.iter().enumerate().skip(1) {
+        for (i, parent) in nodes.iter().enumerate() {
+            let probability = trees.edge_marginals()[(i, j)];
+            if i == j || probability < ObjectPosterior::LEAST_PROBABILITY {
+                continue;
+            }
+            let option = evidence(*child).and_then(|options| option_for(options, *parent, evidence(*parent).is_some()));
+            found.push(edge(*parent, *child, probability, option, learner));
+        }
+    }
+    found.sort_by_key(|e| (e.child, e.parent));
+    found
+}
+
+/// The evidence for a parent: all parts that never moved share that of the world.
+fn option_for(options: &[ParentEvidence], parent: Label, parent_moved: bool) -> Option<&ParentEvidence> {
+    options.iter().find(|o| o.parent == parent_moved.then_some(parent))
+}
+
+fn log_sum(terms: &[f64; 3]) -> f64 {
+    let top = terms.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    top + terms.iter().map(|t| (t - top).exp()).sum::<f64>().ln()
+}
+
+fn edge(
+    parent: Label,
+    child: Label,
+    probability: f64,
+    option: Option<&ParentEvidence>,
+    learner: Option<&Learner>,
+) -> EdgePosterior {
+    let mut joint_type = JointTypeProbabilities::UNIFORM;
+    if let Some(option) = option {
+        let total = log_sum(&option.log_evidence);
+        let [rigid, prismatic, revolute] = option.log_evidence.map(|e| (e - total).exp());
+        joint_type = JointTypeProbabilities { rigid, prismatic, revolute };
+    }
+    let fitted = |joint_type| fitted_axis(option?, learner?, child, joint_type);
+    let revolute = fitted(JointType::Revolute).map(|(axis, covariance)| RevoluteAxis {
+        axis_direction: axis.direction.into(),
+        axis_point_m: axis.point.into(),
+        covariance: std::array::from_fn(|i| std::array::from_fn(|j| covariance[(i, j)])),
+    });
+    let prismatic = fitted(JointType::Prismatic).map(|(axis, covariance)| PrismaticAxis {
+        axis_direction: axis.direction.into(),
+        covariance: std::array::from_fn(|i| std::array::from_fn(|j| covariance[(i, j)])),
+    });
+    let prior = |unit: [&str; 2], median: f64| {
+        let unit = unit[usize::from(joint_type.revolute >= joint_type.prismatic)];
+        Quantity::from_log_normal(unit, median.ln(), 1.5, InformedBy::Prior)
+    };
+    EdgePosterior {
+        parent,
+        child,
+        probability,
+        joint_type,
+        revolute,
+        prismatic,
+        damping: prior(["N·s/m", "N·m·s/rad"], 2.0),
+        friction: prior(["N", "N·m"], 1.0),
+        joint_inertia: prior(["kg", "kg·m²"], 1.0),
+        lower_limit: None,
+        upper_limit: None,
+    }
+}
+
+/// The axis by the joint fit where the edge is in it, else by its own.
+fn fitted_axis(
+    option: &ParentEvidence,
+    learner: &Learner,
+    child: Label,
+    joint_type: JointType,
+) -> Option<(Axis, DMatrix<f64>)> {
+    let own = option.fits[joint_type as usize].as_ref()?;
+    let wide = DMatrix::from_diagonal_element(4, 4, 1.0);
+    let Some(fit) = &learner.fit else { return Some((own.joint.axis, wide)) };
+    let in_fit = fit.joints.iter().enumerate().find(|(_, joint)| {
+        let parent = joint.parent.map(|p| fit.joints[p].child);
+        joint.child == child && joint.joint_type == joint_type && parent == option.parent
+    });
+    let Some((index, joint)) = in_fit else { return Some((own.joint.axis, wide)) };
+    let (offset, count) = (fit.axis_offset(index), joint.axis_parameters());
+    Some((joint.axis, fit.covariance.view((offset, offset), (count, count)).into_owned()))
+}
