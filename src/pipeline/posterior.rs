@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use nalgebra::{DMatrix, Vector3};
+use nalgebra::{DMatrix, Matrix3, Vector3};
 
 use super::{Learner, ParentEvidence, Pipeline};
 use crate::geometry::hull_properties;
@@ -56,15 +56,14 @@ impl Pipeline {
 
 fn part(label: Label, points: &[Vector3<f64>]) -> Option<PartPosterior> {
     let hull = hull_properties(points, None)?;
-    let mut covariance = [[0.0; 3]; 3];
-    for (axis, row) in covariance.iter_mut().enumerate() {
-        row[axis] = (CENTER_SHARE * hull.spread[axis]).powi(2) + 1e-6;
-    }
+    // The same in all directions: the hull's spread is along the world's axes, which mean nothing to the part.
+    let variance = CENTER_SHARE.powi(2) * hull.spread.norm_squared() / 3.0;
+    let covariance = Matrix3::from_diagonal_element(variance);
     let (density, log_sd) = HULL_DENSITY;
     Some(PartPosterior {
         label,
         com_in_world_m: hull.center.into(),
-        com_covariance_m2: covariance,
+        com_covariance_m2: covariance.into(),
         mass_kg: Quantity::from_log_normal("kg", (density * hull.volume).ln(), log_sd, InformedBy::Prior),
     })
 }
