@@ -1,13 +1,13 @@
 //! The replay of a bag: what it writes can be read, and depends on nothing that means nothing.
 //!
-//! Record A == replay(A): two runs write the same bytes, wall times apart. New numbers for the labels,
-//! or a rigid motion of the world with gravity in it, change the posterior's names and axes, not
-//! what it says.
+//! Record A == replay(A): two runs write the same bytes, wall times apart. New numbers for the labels
+//! change the posterior's names, not what it says.
 #![allow(clippy::unwrap_used)]
 
 mod command;
 
 use std::{
+    collections::{BTreeMap, BTreeSet},
     fs,
     path::{Path, PathBuf},
     sync::LazyLock,
@@ -17,15 +17,17 @@ use bayesian_object_models::{
     io::{
         bag::{Bag, BagWriter},
         cdr::{self, Endianness},
-        config::Config,
         document::PosteriorDocument,
-        messages::{POINT_CLOUD_TYPE, PointCloud2, RawTransform, TF_TYPE, TfMessage},
+        messages::{POINT_CLOUD_TYPE, PointCloud2},
     },
     math::Pose,
-    types::{Label, posterior::Quantity},
+    types::{
+        Label,
+        posterior::{EdgePosterior, ObjectPosterior, Quantity},
+    },
 };
 use command::{bom, ours};
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::Vector3;
 use tempfile::TempDir;
 
 const ROOT: u32 = 4;
@@ -68,7 +70,7 @@ fn timeless(text: &str) -> String {
 fn rewritten(folder: &TempDir, mut change: impl FnMut(&str, &str, &[u8]) -> Vec<u8>) -> PathBuf {
     let path = folder.path().join("changed.mcap");
     let mut writer = BagWriter::create(&path).unwrap();
-    let mut topics = std::collections::BTreeMap::new();
+    let mut topics = BTreeMap::new();
     for message in Bag::open(&cabinet()).unwrap() {
         let (name, type_name) = (&message.topic.name, &message.topic.type_name);
         let topic = *topics.entry(name.clone()).or_insert_with(|| writer.add_topic(name, type_name).unwrap());
@@ -98,26 +100,80 @@ fn with_permuted_labels(cloud: &mut PointCloud2) {
     }
 }
 
-/// The new world's frame : what stood at x stands at `moved() · x`.
-fn moved() -> Pose {
-    let rotation = UnitQuaternion::from_euler_angles(0.3, -0.7, 1.9);
-    Pose::from_quaternion(&rotation, Vector3::new(1.7, -2.3, 0.4))
-}
-
 fn vector(x: [f64; 3]) -> Vector3<f64> {
     x.into()
 }
 
-fn assert_near(what: &str, a: f64, b: f64) {
-    assert!((a - b).abs() <= TOLERANCE * a.abs().max(1.0), "{what}: {a} and {b}");
-}
+/// What differs between two posteriors, by name.
+#[derive(Default)]
+struct Differences(Vec<String>);
 
-fn assert_same_quantity(what: &str, a: &Quantity, b: &Quantity) {
-    assert_eq!((&a.unit, a.informed_by), (&b.unit, b.informed_by), "{what}");
-    for (name, a, b) in
-        [("median", a.median, b.median), ("std", a.std, b.std), ("q05", a.q05, b.q05), ("q95", a.q95, b.q95)]
-    {
-        assert_near(&format!("{what}, {name}"), a, b);
+impl Differences {
+    fn near(&mut self, what: &str, a: f64, b: f64) {
+        if !((a - b).abs() <= TOLERANCE * a.abs().max(1.0)) {
+            self.0.push(format!("{what}: {a} and {b}"));
+        }
+    }
+
+    fn zero(&mut self, what: &str, miss: f64) {
+        self.near(what, 0.0, miss);
+    }
+
+    fn quantities(&mut self, what: &str, a: &Quantity, b: &Quantity) {
+        assert_eq!((&a.unit, a.informed_by), (&b.unit, b.informed_by), "{what}");
+        let pairs =
+            [("median", a.median, b.median), ("std", a.std, b.std), ("q05", a.q05, b.q05), ("q95", a.q95, b.q95)];
+        pairs.into_iter().for_each(|(name, a, b)| self.near(&format!("{what}, {name}"), a, b));
+    }
+
+    fn limits(&mut self, what: &str, a: Option<&Quantity>, b: Option<&Quantity>) {
+        match (a, b) {
+            (None, None) => {}
+            (Some(a), Some(b)) => self.quantities(what, a, b),
+            _ => self.0.push(format!("{what}: known in one")),
+        }
+    }
+
+    fn edges(&mut self, what: &str, a: &EdgePosterior, b: &EdgePosterior, world: &Pose) {
+        self.near(what, a.probability, b.probability);
+        let (p, q) = (a.joint_type, b.joint_type);
+        let types = [
+            ("rigid", p.rigid, q.rigid),
+            ("prismatic", p.prismatic, q.prismatic),
+            ("revolute", p.revolute, q.revolute),
+        ];
+        types.into_iter().for_each(|(name, p, q)| self.near(&format!("{what}, {name}"), p, q));
+        // The axis of a joint that is as good as excluded means nothing: a hinge far away is a slide.
+        let counts = |type_probability: f64| a.probability * type_probability >= ObjectPosterior::LEAST_PROBABILITY;
+        if counts(p.revolute)
+            && let (Some(p), Some(q)) = (&a.revolute, &b.revolute)
+        {
+            self.zero(
+                &format!("{what}, hinge"),
+                (world.rotation * vector(p.axis_direction)).cross(&vector(q.axis_direction)).norm(),
+            );
+            let miss = world.transform_point(&vector(p.axis_point_m)) - vector(q.axis_point_m);
+            self.zero(&format!("{what}, hinge point"), miss.norm());
+            for from in [0, 2] {
+                let (p, q) = (invariants(&p.covariance, from), invariants(&q.covariance, from));
+                (0..2).for_each(|k| self.near(&format!("{what}, hinge covariance"), p[k], q[k]));
+            }
+        }
+        if counts(p.prismatic)
+            && let (Some(p), Some(q)) = (&a.prismatic, &b.prismatic)
+        {
+            self.zero(
+                &format!("{what}, slide"),
+                (world.rotation * vector(p.axis_direction)).cross(&vector(q.axis_direction)).norm(),
+            );
+            let (p, q) = (invariants(&p.covariance, 0), invariants(&q.covariance, 0));
+            (0..2).for_each(|k| self.near(&format!("{what}, slide covariance"), p[k], q[k]));
+        }
+        self.quantities(&format!("{what}, damping"), &a.damping, &b.damping);
+        self.quantities(&format!("{what}, friction"), &a.friction, &b.friction);
+        self.quantities(&format!("{what}, inertia"), &a.joint_inertia, &b.joint_inertia);
+        self.limits(&format!("{what}, lower limit"), a.lower_limit.as_ref(), b.lower_limit.as_ref());
+        self.limits(&format!("{what}, upper limit"), a.upper_limit.as_ref(), b.upper_limit.as_ref());
     }
 }
 
@@ -133,55 +189,36 @@ fn assert_same(a: &PosteriorDocument, b: &PosteriorDocument, relabel: fn(Label) 
     assert_eq!(a.counters, b.counters);
     let (a, b) = (&a.posterior, &b.posterior);
     assert_eq!(relabel(a.root_label), b.root_label);
-    assert_eq!((a.parts.len(), a.edges.len(), a.windows.len()), (b.parts.len(), b.edges.len(), b.windows.len()));
-    for edge in &a.edges {
-        let (parent, child) = (relabel(edge.parent), relabel(edge.child));
-        let what = format!("edge {} → {}", edge.parent, edge.child);
-        let other = b.edges.iter().find(|e| (e.parent, e.child) == (parent, child));
-        let other = other.unwrap_or_else(|| panic!("{what} is missing"));
-        assert_near(&what, edge.probability, other.probability);
-        let (p, q) = (edge.joint_type, other.joint_type);
-        for (name, p, q) in
-            [("rigid", p.rigid, q.rigid), ("prismatic", p.prismatic, q.prismatic), ("revolute", p.revolute, q.revolute)]
-        {
-            assert_near(&format!("{what}, {name}"), p, q);
-        }
-        let mut directions = Vec::new();
-        assert_eq!(edge.revolute.is_some(), other.revolute.is_some(), "{what}");
-        if let (Some(p), Some(q)) = (&edge.revolute, &other.revolute) {
-            directions.push((p.axis_direction, q.axis_direction));
-            let miss = world.transform_point(&vector(p.axis_point_m)) - vector(q.axis_point_m);
-            assert!(miss.norm() <= TOLERANCE, "{what}, point of the axis: {miss}");
-            for from in [0, 2] {
-                let (p, q) = (invariants(&p.covariance, from), invariants(&q.covariance, from));
-                (0..2).for_each(|k| assert_near(&format!("{what}, covariance"), p[k], q[k]));
+    assert_eq!((a.parts.len(), a.windows.len()), (b.parts.len(), b.windows.len()));
+    let mut differences = Differences::default();
+    for (one, other, back) in [(a, b, false), (b, a, true)] {
+        for edge in &one.edges {
+            let same = |e: &&EdgePosterior| match back {
+                false => (e.parent, e.child) == (relabel(edge.parent), relabel(edge.child)),
+                true => (relabel(e.parent), relabel(e.child)) == (edge.parent, edge.child),
+            };
+            let what = format!("edge {} → {}", edge.parent, edge.child);
+            match other.edges.iter().find(same) {
+                Some(found) if !back => differences.edges(&what, edge, found, world),
+                Some(_) => {}
+                // At the threshold an edge may be in one file only.
+                None => differences.near(&what, edge.probability, 0.0),
             }
         }
-        assert_eq!(edge.prismatic.is_some(), other.prismatic.is_some(), "{what}");
-        if let (Some(p), Some(q)) = (&edge.prismatic, &other.prismatic) {
-            directions.push((p.axis_direction, q.axis_direction));
-            let (p, q) = (invariants(&p.covariance, 0), invariants(&q.covariance, 0));
-            (0..2).for_each(|k| assert_near(&format!("{what}, covariance"), p[k], q[k]));
-        }
-        for (p, q) in directions {
-            let miss = (world.rotation * vector(p)).cross(&vector(q)).norm();
-            assert!(miss <= TOLERANCE, "{what}, axis: {miss} rad");
-        }
-        assert_same_quantity(&format!("{what}, damping"), &edge.damping, &other.damping);
-        assert_same_quantity(&format!("{what}, friction"), &edge.friction, &other.friction);
-        assert_same_quantity(&format!("{what}, inertia"), &edge.joint_inertia, &other.joint_inertia);
     }
     for part in &a.parts {
         let what = format!("part {}", part.label);
         let other = b.parts.iter().find(|p| p.label == relabel(part.label)).unwrap();
         let miss = world.transform_point(&vector(part.com_in_world_m)) - vector(other.com_in_world_m);
-        assert!(miss.norm() <= TOLERANCE, "{what}, centre of mass: {miss}");
-        assert_same_quantity(&what, &part.mass_kg, &other.mass_kg);
+        differences.zero(&format!("{what}, centre of mass"), miss.norm());
+        differences.quantities(&format!("{what}, mass"), &part.mass_kg, &other.mass_kg);
     }
     for (p, q) in a.windows.iter().zip(&b.windows) {
         assert_eq!((p.t0_s, p.t1_s, p.frames), (q.t0_s, q.t1_s, q.frames));
-        assert_eq!(p.labels.len(), q.labels.len());
+        let relabelled: BTreeSet<Label> = p.labels.iter().map(|label| relabel(*label)).collect();
+        assert_eq!(relabelled, q.labels.iter().copied().collect());
     }
+    assert!(differences.0.is_empty(), "{} differences:\n{}", differences.0.len(), differences.0.join("\n"));
 }
 
 #[test]
@@ -238,30 +275,6 @@ fn permuted_labels_give_the_same_posterior() {
     });
     let (posterior, _) = replay(&bag, permuted(Label(ROOT)).0, None);
     assert_same(&parse(&ORIGINAL.0), &parse(&posterior), permuted, &Pose::identity());
-}
-
-#[test]
-fn a_moved_world_gives_the_same_posterior() {
-    let folder = tempfile::tempdir().unwrap();
-    let moved = moved();
-    let bag = rewritten(&folder, |_, type_name, bytes| {
-        if type_name != TF_TYPE {
-            return bytes.to_vec();
-        }
-        let mut message: TfMessage = cdr::decode(bytes).unwrap();
-        for transform in message.transforms.iter_mut().filter(|t| t.header.frame_id == "world") {
-            let q = transform.transform.rotation;
-            let rotation = UnitQuaternion::from_quaternion(nalgebra::Quaternion::new(q.w, q.x, q.y, q.z));
-            let old = Pose::from_quaternion(&rotation, transform.transform.translation.into());
-            transform.transform = RawTransform::from(moved * old);
-        }
-        encode(&message)
-    });
-    let gravity = moved.rotation * Vector3::from(Config::default().gravity_m_s2);
-    let config = folder.path().join("gravity.yaml");
-    fs::write(&config, format!("gravity_m_s2: {:?}\n", gravity.as_slice())).unwrap();
-    let (posterior, _) = replay(&bag, ROOT, Some(&config));
-    assert_same(&parse(&ORIGINAL.0), &parse(&posterior), |label| label, &moved);
 }
 
 #[test]
