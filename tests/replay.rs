@@ -110,7 +110,8 @@ struct Differences(Vec<String>);
 
 impl Differences {
     fn near(&mut self, what: &str, a: f64, b: f64) {
-        if !((a - b).abs() <= TOLERANCE * a.abs().max(1.0)) {
+        let is_near = (a - b).abs() <= TOLERANCE * a.abs().max(1.0);
+        if !is_near {
             self.0.push(format!("{what}: {a} and {b}"));
         }
     }
