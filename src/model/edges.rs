@@ -57,16 +57,22 @@ pub fn relative_windows(child: Label, track: Option<&[Vec<Pose>]>, windows: &[&W
             let reference = |k: usize| track.map_or_else(Pose::identity, |t| t[w][k].inverse());
             let moves = track.is_some_and(|t| t[w].windows(2).any(|pair| pair[0] != pair[1]));
             let blur = if moves { PARENT_SIGMA } else { 0.0 };
-            let poses = window.poses.get(&child).map(|poses| {
+            let relative = |poses: &BTreeMap<Label, Vec<Option<PoseMeasurement>>>| {
                 poses
-                    .iter()
-                    .enumerate()
-                    .map(|(k, m)| m.map(|m| PoseMeasurement { displacement: reference(k) * m.displacement, ..m }))
+                    .get(&child)
+                    .map(|poses| {
+                        let seen = |(k, m): (usize, &Option<PoseMeasurement>)| {
+                            m.map(|m| PoseMeasurement { displacement: reference(k) * m.displacement, ..m })
+                        };
+                        (child, poses.iter().enumerate().map(seen).collect())
+                    })
+                    .into_iter()
                     .collect()
-            });
+            };
             WindowObservations {
                 times_s: window.times_s.clone(),
-                poses: poses.map(|p| BTreeMap::from([(child, p)])).unwrap_or_default(),
+                poses: relative(&window.poses),
+                later_faces: relative(&window.later_faces),
                 contacts: window
                     .contacts
                     .iter()
@@ -76,7 +82,7 @@ pub fn relative_windows(child: Label, track: Option<&[Vec<Pose>]>, windows: &[&W
                         track: c.track.iter().map(|(k, x, s)| (*k, reference(*k).transform_point(x), s.hypot(blur))).collect(),
                     })
                     .collect(),
-                wrenches: Vec::new(),
+                ..WindowObservations::default()
             }
         })
         .collect()
@@ -98,12 +104,14 @@ pub fn rigid_evidence(part: &EdgePart, windows: &[WindowObservations], settings:
     -TEMPERATURE * fit_kinematics(vec![still], positions, &references, &frozen).cost
 }
 
-/// Fits one moving type from each start axis and keeps the best.
+/// Fits one moving type from each start axis and keeps the best; `resting`: the windows in which the
+/// part keeps its place on the parent.
 pub fn moving_evidence(
     part: &EdgePart,
     joint_type: JointType,
     starts: &[Axis],
     windows: &[WindowObservations],
+    resting: &[bool],
     settings: &KinematicSettings,
 ) -> Option<EdgeFit> {
     let references: Vec<&WindowObservations> = windows.iter().collect();
@@ -119,7 +127,8 @@ pub fn moving_evidence(
                 center: part.center,
                 radius: part.radius,
             };
-            let positions = windows.iter().map(|w| vec![start_positions(&joint, w)]).collect();
+            let positions =
+                windows.iter().zip(resting).map(|(w, rests)| vec![start_positions(&joint, w, *rests)]).collect();
             let fit = fit_kinematics(vec![joint], positions, &references, settings);
             let parameters = joint.axis_parameters();
             let width = joint.axis_point_prior();
@@ -185,19 +194,26 @@ fn far_axes(shift: &Vector3<f64>, center: &Vector3<f64>) -> Vec<Axis> {
         .collect()
 }
 
-/// Joint positions nearest the measured poses: Gauss–Newton on each frame alone.
-fn start_positions(joint: &KinematicJoint, window: &WindowObservations) -> Vec<f64> {
+/// Joint positions nearest the measured poses: Gauss–Newton on each frame alone, or their median
+/// where the joint rests.
+fn start_positions(joint: &KinematicJoint, window: &WindowObservations, rests: bool) -> Vec<f64> {
     let screw = joint.screw();
     let mut last = 0.0;
     let poses = window.poses.get(&joint.child);
-    (0..window.times_s.len())
+    let mut positions: Vec<f64> = (0..window.times_s.len())
         .map(|k| {
             if let Some(m) = poses.and_then(|p| p[k]) {
                 last = nearest_position(joint, &screw, &m, last);
             }
             last
         })
-        .collect()
+        .collect();
+    if rests && !positions.is_empty() {
+        let mut sorted = positions.clone();
+        sorted.sort_by(f64::total_cmp);
+        positions.fill(sorted[sorted.len() / 2]);
+    }
+    positions
 }
 
 fn nearest_position(joint: &KinematicJoint, screw: &Screw, measured: &PoseMeasurement, start: f64) -> f64 {

@@ -14,10 +14,13 @@ use std::rc::Rc;
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
 use serde::{Deserialize, Serialize};
 
-use super::window::{Contact, WindowObservations};
+use super::window::{Contact, PoseMeasurement, WindowObservations};
 use crate::math::{Pose, Screw, orthonormal_pair};
 use crate::mechanism::JointType;
 use crate::types::Label;
+
+/// Standard deviation of the pose at which later faces were added to a model \[m\].
+const FACE_ERROR_SIGMA: f64 = 0.020;
 
 /// A joint axis in world at the reference configuration.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -136,7 +139,8 @@ pub struct KinematicFit {
     pub contact_points: Vec<Vec<Vector3<f64>>>,
     /// The tool's offset in world \[m\].
     pub tool_offset: Vector3<f64>,
-    /// Covariance of all axis parameters, joint by joint, then the tool's offset.
+    /// Covariance of all axis parameters, joint by joint, then six face errors a joint, then the
+    /// tool's offset.
     pub covariance: DMatrix<f64>,
     /// Negative log density at the solution, up to constants of the data.
     pub cost: f64,
@@ -169,7 +173,8 @@ fn forward(joints: &[KinematicJoint], position: impl Fn(usize) -> f64) -> Vec<Po
 }
 
 /// Fits axes and joint positions to the windows, from the joints' start axes and start positions
-/// (by window, joint, frame). Parents come before their children in `joints`.
+/// (by window, joint, frame). Parents come before their children in `joints`. A joint whose start
+/// positions are all the same in a window rests in it: friction holds what is not pushed.
 pub fn fit_kinematics(
     joints: Vec<KinematicJoint>,
     positions: Vec<Vec<Vec<f64>>>,
@@ -234,7 +239,9 @@ struct Problem<'a> {
     /// By window: how many local position unknowns.
     slot_counts: Vec<usize>,
     /// By window, joint, frame: information after the error that frames at one pose share.
-    information: Rc<Vec<Vec<Vec<Option<Matrix6<f64>>>>>>,
+    information: Rc<Vec<Vec<Vec<[Option<Matrix6<f64>>; 2]>>>>,
+    /// By joint: the rigid error of the faces that its child showed later, as ξ about the center.
+    face_errors: Vec<Vector6<f64>>,
     contact_points: Vec<Vec<Vector3<f64>>>,
     tool_offset: Vector3<f64>,
     by_label: BTreeMap<Label, usize>,
@@ -256,25 +263,34 @@ impl<'a> Problem<'a> {
             slots: Vec::new(),
             slot_counts: Vec::new(),
             information: Rc::default(),
+            face_errors: Vec::new(),
             contact_points: Vec::new(),
             tool_offset: Vector3::zeros(),
             by_label,
         };
+        problem.face_errors = vec![Vector6::zeros(); problem.joints.len()];
         problem.separate_frames();
         problem.information = Rc::new(problem.informations(|_, _, _| 1.0));
         problem.contact_points = (0..windows.len()).map(|w| problem.initial_contact_points(w)).collect();
         problem
     }
 
-    /// Every frame its own unknown.
+    /// Every frame its own unknown, or one for a whole window where a joint rests.
     fn separate_frames(&mut self) {
-        let joints = self.joints.len();
-        self.slots = self
-            .windows
-            .iter()
-            .map(|w| (0..joints).map(|j| (0..w.times_s.len()).map(|k| j * w.times_s.len() + k).collect()).collect())
-            .collect();
-        self.slot_counts = self.windows.iter().map(|w| joints * w.times_s.len()).collect();
+        self.slots.clear();
+        self.slot_counts.clear();
+        for window in &self.positions {
+            let mut next = 0;
+            let mut slots = Vec::with_capacity(window.len());
+            for positions in window {
+                let resting = positions.windows(2).all(|pair| pair[0] == pair[1]);
+                let count = if resting { 1 } else { positions.len() };
+                slots.push((0..positions.len()).map(|k| next + k.min(count - 1)).collect());
+                next += count;
+            }
+            self.slots.push(slots);
+            self.slot_counts.push(next);
+        }
     }
 
     fn initial_contact_points(&self, window: usize) -> Vec<Vector3<f64>> {
@@ -294,10 +310,10 @@ impl<'a> Problem<'a> {
     }
 
     /// Information of every measurement, given how many frames share its registration error.
-    fn informations(&self, sharing: impl Fn(usize, usize, usize) -> f64) -> Vec<Vec<Vec<Option<Matrix6<f64>>>>> {
-        let one = |w: usize, j: usize, frame: usize| {
+    fn informations(&self, sharing: impl Fn(usize, usize, usize) -> f64) -> Vec<Vec<Vec<[Option<Matrix6<f64>>; 2]>>> {
+        let one = |w: usize, j: usize, frame: usize, face: usize| {
             let joint = &self.joints[j];
-            let raw = self.windows[w].poses.get(&joint.child)?[frame]?.information;
+            let raw = self.measured(w, j, frame, face)?.information;
             let scale = Vector6::new(joint.radius, joint.radius, joint.radius, 1.0, 1.0, 1.0);
             let scaled = Matrix6::from_fn(|i, j| raw[(i, j)] / (scale[i] * scale[j]));
             let mut eigen = scaled.symmetric_eigen();
@@ -309,15 +325,26 @@ impl<'a> Problem<'a> {
         (0..self.windows.len())
             .map(|w| {
                 let frames = self.windows[w].times_s.len();
-                (0..self.joints.len()).map(|j| (0..frames).map(|k| one(w, j, k)).collect()).collect()
+                (0..self.joints.len()).map(|j| (0..frames).map(|k| [0, 1].map(|face| one(w, j, k, face))).collect()).collect()
             })
             .collect()
     }
 
-    fn measurement(&self, w: usize, j: usize, frame: usize) -> Option<(&Pose, Matrix6<f64>)> {
-        let information = self.information[w][j][frame]?;
-        let measured = self.windows[w].poses.get(&self.joints[j].child)?[frame].as_ref()?;
-        Some((&measured.displacement, information))
+    fn measured(&self, w: usize, j: usize, frame: usize, face: usize) -> Option<&PoseMeasurement> {
+        let window = self.windows[w];
+        let poses = if face == 0 { &window.poses } else { &window.later_faces };
+        poses.get(&self.joints[j].child)?[frame].as_ref()
+    }
+
+    /// Residual and information of each measurement of a joint's child in a frame, by faces.
+    fn residuals(&self, w: usize, j: usize, frame: usize, predicted: &Pose) -> impl Iterator<Item = (usize, Vector6<f64>, Matrix6<f64>)> {
+        let one = |face: usize| {
+            let information = self.information[w][j][frame][face]?;
+            let measured = self.measured(w, j, frame, face)?;
+            let r = pose_residual(&self.joints[j], &measured.displacement, predicted);
+            Some((face, if face == 0 { r } else { r - self.face_errors[j] }, information))
+        };
+        [one(0), one(1)].into_iter().flatten()
     }
 
     fn student_cost(&self, chi_squared: f64, dimensions: f64) -> f64 {
@@ -332,17 +359,19 @@ impl<'a> Problem<'a> {
 
     fn cost(&self) -> f64 {
         let mut cost = 0.5 * self.tool_offset.norm_squared() / self.settings.tool_offset_sigma.powi(2);
+        for (j, error) in self.face_errors.iter().enumerate() {
+            cost += 0.5 * error.component_mul(error).dot(&self.face_error_information(j));
+        }
         for joint in self.joints.iter().filter(|j| j.joint_type == JointType::Revolute) {
             cost += 0.5 * (joint.axis.point - joint.center).norm_squared() / joint.axis_point_prior().powi(2);
         }
         for (w, window) in self.windows.iter().enumerate() {
             for frame in 0..window.times_s.len() {
                 let displacements = forward(&self.joints, |j| self.positions[w][j][frame]);
-                for (j, joint) in self.joints.iter().enumerate() {
-                    let Some((measured, information)) = self.measurement(w, j, frame) else { continue };
-                    let r = pose_residual(joint, measured, &displacements[j]);
-                    let chi_squared = r.dot(&(information * r));
-                    cost += self.student_cost(chi_squared, 6.0);
+                for j in 0..self.joints.len() {
+                    for (_, r, information) in self.residuals(w, j, frame, &displacements[j]) {
+                        cost += self.student_cost(r.dot(&(information * r)), 6.0);
+                    }
                 }
             }
             for (c, contact) in window.contacts.iter().enumerate() {
@@ -361,8 +390,20 @@ impl<'a> Problem<'a> {
         x - self.tool_offset - displacement.transform_point(&self.contact_points[window][contact])
     }
 
+    fn axis_count(&self) -> usize {
+        self.joints.iter().map(KinematicJoint::axis_parameters).sum()
+    }
+
+    /// Axis parameters, then six face errors a joint, then the tool's offset.
     fn global_count(&self) -> usize {
-        self.joints.iter().map(KinematicJoint::axis_parameters).sum::<usize>() + 3
+        self.axis_count() + 6 * self.joints.len() + 3
+    }
+
+    /// Prior information of a joint's face error, per component.
+    fn face_error_information(&self, joint: usize) -> Vector6<f64> {
+        let length = FACE_ERROR_SIGMA.powi(-2);
+        let angle = length * self.joints[joint].radius.powi(2);
+        Vector6::new(angle, angle, angle, length, length, length)
     }
 
     fn linearize(&self) -> Vec<WindowSystem> {
@@ -372,6 +413,7 @@ impl<'a> Problem<'a> {
     fn linearize_window(&self, w: usize) -> WindowSystem {
         let window = self.windows[w];
         let globals = self.global_count();
+        let axes = self.axis_count();
         let locals = self.slot_counts[w] + 3 * window.contacts.len();
         let mut system = WindowSystem {
             local: DMatrix::identity(locals, locals) * 1e-2,
@@ -390,12 +432,17 @@ impl<'a> Problem<'a> {
             let displacements = forward(&self.joints, |j| self.positions[w][j][frame]);
             let columns = self.twist_columns(w, frame, &displacements);
             for (j, joint) in self.joints.iter().enumerate() {
-                let Some((measured, information)) = self.measurement(w, j, frame) else { continue };
-                let r = pose_residual(joint, measured, &displacements[j]);
-                let weight = self.student_weight(r.dot(&(information * r)), 6.0);
                 let into_body = (Pose::from_translation(-joint.center) * displacements[j].inverse()).adjoint_matrix();
-                let jacobian: Vec<_> = columns[j].iter().map(|(at, v)| (*at, into_body * v)).collect();
-                accumulate(&mut system, &jacobian, &(information * weight), &r);
+                let twists: Vec<_> = columns[j].iter().map(|(at, v)| (*at, into_body * v)).collect();
+                for (face, r, information) in self.residuals(w, j, frame, &displacements[j]) {
+                    let weight = self.student_weight(r.dot(&(information * r)), 6.0);
+                    let mut jacobian = twists.clone();
+                    if face == 1 {
+                        let unit = |i: usize| -Matrix6::identity().column(i);
+                        jacobian.extend((0..6).map(|i| (Slot::Global(axes + 6 * j + i), unit(i))));
+                    }
+                    accumulate(&mut system, &jacobian, &(information * weight), &r);
+                }
             }
             for (c, x, sigma) in touches {
                 let Some(&j) = self.by_label.get(&window.contacts[*c].label) else { continue };
@@ -456,6 +503,14 @@ impl<'a> Problem<'a> {
             }
             at += joint.axis_parameters();
         }
+        for (j, error) in self.face_errors.iter().enumerate() {
+            let information = self.face_error_information(j);
+            for i in 0..6 {
+                matrix[(at + i, at + i)] += information[i];
+                gradient[at + i] += information[i] * error[i];
+            }
+            at += 6;
+        }
         let offset_information = 1.0 / self.settings.tool_offset_sigma.powi(2);
         for i in 0..3 {
             matrix[(globals - 3 + i, globals - 3 + i)] += offset_information;
@@ -495,6 +550,10 @@ impl<'a> Problem<'a> {
             let count = joint.axis_parameters();
             joint.retract(&global_step.as_slice()[offset..offset + count]);
             offset += count;
+        }
+        for error in &mut next.face_errors {
+            *error += global_step.fixed_rows::<6>(offset);
+            offset += 6;
         }
         next.tool_offset += global_step.fixed_rows::<3>(offset);
         for (w, solve) in solves.iter().enumerate() {
@@ -561,20 +620,6 @@ impl<'a> Problem<'a> {
     }
 
     fn finish(self, cost: f64, converged: bool) -> KinematicFit {
-        if std::env::var("DUMP").is_ok() && self.windows.len() > 1 {
-            for (w, window) in self.windows.iter().enumerate() {
-                for frame in 0..window.times_s.len() {
-                    let displacements = forward(&self.joints, |j| self.positions[w][j][frame]);
-                    for (j, joint) in self.joints.iter().enumerate() {
-                        let Some((measured, information)) = self.measurement(w, j, frame) else { continue };
-                        let r = pose_residual(joint, measured, &displacements[j]);
-                        let raw = self.windows[w].poses[&joint.child][frame].unwrap().information;
-                        let tool = window.contacts.iter().enumerate().find(|(_, c)| c.label == joint.child).and_then(|(c, k)| k.track.iter().find(|t| t.0 == frame).map(|t| { let e = self.contact_residual(&displacements[j], &t.1, w, c); (1e3 * e, t.2 * 1e3) }));
-                        eprintln!("DUMP {w} {} j{} q {:.4} chi {:.1} raw {:.1} rot {:.2?} mm {:.2?} sd {:.2?} tool {:?}", window.times_s[frame], joint.child, self.positions[w][j][frame], r.dot(&(information * r)), r.dot(&(raw * r)), (r * 57.3).fixed_rows::<3>(0).as_slice(), (r * 1e3).fixed_rows::<3>(3).as_slice(), (0..6).map(|i| if i < 3 {57.3} else {1e3} / raw[(i,i)].sqrt()).collect::<Vec<_>>(), tool.map(|t| (format!("{:.2?}", t.0.as_slice()), t.1)));
-                    }
-                }
-            }
-        }
         let systems = self.linearize();
         let (matrix, _, _) = self.reduced(&systems, 0.0);
         let globals = matrix.nrows();

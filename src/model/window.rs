@@ -30,8 +30,11 @@ pub struct Contact {
 pub struct WindowObservations {
     /// Seconds since time zero of each frame.
     pub times_s: Vec<f64>,
-    /// Per part and frame.
+    /// Per part and frame, against the faces of the first look.
     pub poses: BTreeMap<Label, Vec<Option<PoseMeasurement>>>,
+    /// Per part and frame, against the faces that came into view later: they stand where a fit put
+    /// them, so these measure the displacement up to one unknown rigid error per part.
+    pub later_faces: BTreeMap<Label, Vec<Option<PoseMeasurement>>>,
     /// Tool tracks.
     pub contacts: Vec<Contact>,
     /// Every wrench reading, from before the window to after it.

@@ -13,7 +13,7 @@ use crate::math::{Pose, Screw};
 use crate::mechanism::JointType;
 use crate::model::{Axis, Contact, KinematicJoint, KinematicSettings, PoseMeasurement, WindowObservations, fit_kinematics};
 use crate::registration::{
-    AlignmentSettings, AxisSeed, JointFrame, JointPath, PartModel, PoseFactor, ScanPoint, fit_circle, fit_line,
+    AlignmentSettings, AxisSeed, JointFrame, JointPath, PartModel, Quadratic, ScanPoint, fit_circle, fit_line,
     geometric_seeds, pose_factor, search_path, truncated_cost,
 };
 use crate::types::Label;
@@ -299,7 +299,9 @@ impl Scene<'_> {
         });
         let path = self.path(label, &joint.screw(), joint_type, parents, contact_point.as_ref());
         let mut positions = path.positions;
-        let settings = KinematicSettings { steps: 8, ..KinematicSettings::default() };
+        // Faces that come into view match wrongly at first: where the tool is felt, it leads.
+        let shared_error = if contact.is_some() { 0.010 } else { KinematicSettings::default().shared_error };
+        let settings = KinematicSettings { steps: 8, shared_error, ..KinematicSettings::default() };
         for gate in [0.05, 0.03, 0.02] {
             let alignment = AlignmentSettings { gate, ..AlignmentSettings::default() };
             let screw = joint.screw();
@@ -322,7 +324,7 @@ impl Scene<'_> {
                 times_s: self.frames.iter().map(|f| f.time_s).collect(),
                 poses: BTreeMap::from([(label, poses)]),
                 contacts,
-                wrenches: Vec::new(),
+                ..WindowObservations::default()
             };
             let fit = fit_kinematics(vec![joint], vec![vec![positions]], &[&window], &settings);
             joint = fit.joints[0];
@@ -360,11 +362,24 @@ pub fn measure(model: &PartModel, scan: &[ScanPoint], predicted: &Pose, settings
     if factor.matched < FEWEST_POINTS {
         return None;
     }
-    Some(measurement_of(model, &factor, predicted))
+    let whole = Quadratic { hessian: factor.hessian(), gradient: factor.gradient() };
+    Some(measurement_of(model, &whole, predicted))
+}
+
+/// As `measure`, apart for the faces of the first look and for those that came into view later.
+pub fn measure_faces(model: &PartModel, scan: &[ScanPoint], predicted: &Pose, settings: &AlignmentSettings) -> [Option<PoseMeasurement>; 2] {
+    if scan.len() < FEWEST_POINTS {
+        return [None; 2];
+    }
+    let factor = pose_factor(model, scan, predicted, settings);
+    if factor.matched < FEWEST_POINTS {
+        return [None; 2];
+    }
+    factor.faces.map(|face| (face.hessian.trace() > 0.0).then(|| measurement_of(model, &face, predicted)))
 }
 
 /// The pose measurement of a factor taken at `predicted`.
-pub fn measurement_of(model: &PartModel, factor: &PoseFactor, predicted: &Pose) -> PoseMeasurement {
+pub fn measurement_of(model: &PartModel, factor: &Quadratic, predicted: &Pose) -> PoseMeasurement {
     let information = factor.information(model.radius, FALSE_SHARE);
     let weak = Vector6::new(model.radius, model.radius, model.radius, 1.0, 1.0, 1.0).map(|s| s * s / MEASURED_WITHIN.powi(2));
     let step = (information + Matrix6::from_diagonal(&weak))

@@ -4,19 +4,25 @@ use std::collections::BTreeMap;
 
 use nalgebra::{DMatrix, Vector3};
 
-use super::explain::{Frame, Motion, Scene, explain_window, measure, travel};
+use super::explain::{Frame, Motion, Scene, explain_window, measure_faces, travel};
 use crate::math::Pose;
 use crate::mechanism::JointType;
 use crate::model::{
     Axis, Contact, EdgeFit, EdgePart, KinematicFit, KinematicJoint, KinematicSettings, WindowObservations, axes_from_motion,
     fit_kinematics, moving_evidence, relative_windows, rigid_evidence,
 };
-use crate::registration::{AlignmentSettings, PartModel, SurfelAccumulator, fit_circle, fit_line, truncated_cost};
+use crate::registration::{AlignmentSettings, PartModel, ScanPoint, Surfel, SurfelAccumulator, fit_circle, fit_line, truncated_cost};
 use crate::structure::TreeDistribution;
 use crate::types::{AppliedWrench, Label};
 
 /// A part moved if it ever travelled further than this \[m\].
 const MOVED: f64 = 0.006;
+
+/// A part that stays within this of its place on its parent rests there \[m\].
+const RESTS: f64 = 1e-6;
+/// Scans kept from each window for growing a part's model, and in all.
+const KEYFRAMES_PER_WINDOW: usize = 10;
+const MOST_KEYFRAMES: usize = 40;
 
 /// One closed window, ready to be learned.
 #[derive(Clone, Debug, Default)]
@@ -48,8 +54,10 @@ pub struct Learner {
     pub use_tool: bool,
     /// Reference models.
     pub models: BTreeMap<Label, PartModel>,
-    /// Where the models grow from.
-    pub accumulators: BTreeMap<Label, SurfelAccumulator>,
+    /// Surfels of the first look.
+    reference: BTreeMap<Label, Vec<Surfel>>,
+    /// Scans that the models grow from, with their window and frame.
+    keyframes: BTreeMap<Label, Vec<(usize, usize, Vec<ScanPoint>)>>,
     /// Mean truncated cost per point at known poses.
     pub baselines: BTreeMap<Label, f64>,
     /// Displacements after the last window.
@@ -69,12 +77,14 @@ pub struct Learner {
 impl Learner {
     /// Nothing learned yet: models from the scans accumulated at the reference configuration.
     pub fn new(root: Label, use_tool: bool, accumulators: BTreeMap<Label, SurfelAccumulator>) -> Self {
-        let models = accumulators.iter().filter_map(|(label, a)| Some((*label, a.build()?))).collect();
+        let reference: BTreeMap<Label, Vec<Surfel>> = accumulators.iter().map(|(label, a)| (*label, a.surfels())).collect();
+        let models = reference.iter().filter_map(|(label, s)| Some((*label, PartModel::new(s, &[])?))).collect();
         Self {
             root,
             use_tool,
             models,
-            accumulators,
+            reference,
+            keyframes: BTreeMap::new(),
             baselines: BTreeMap::new(),
             displacements: BTreeMap::new(),
             windows: Vec::new(),
@@ -128,24 +138,44 @@ impl Learner {
             ..WindowObservations::default()
         };
         for (label, motion) in &motions {
-            observations.poses.insert(*label, self.measure_along(*label, &motion.displacements, &job.frames));
             self.tracks.entry(*label).or_default().push(motion.displacements.clone());
         }
         self.windows.push(observations);
+        self.grow(job, &motions);
+        for label in motions.keys() {
+            self.measure(*label, &job.frames);
+        }
         self.weigh_edges(&motions);
         self.fit_joints();
-        self.remeasure(job);
+        self.rebuild_models();
+        let labels: Vec<Label> = self.joints().iter().map(|j| j.child).collect();
+        for label in labels {
+            self.measure(label, &job.frames);
+        }
         self.fit_joints();
-        self.grow(job);
+        for (label, tracks) in &self.tracks {
+            if let Some(end) = tracks.last().and_then(|t| t.last()) {
+                self.displacements.insert(*label, *end);
+            }
+        }
     }
 
-    fn measure_along(&self, label: Label, track: &[Pose], frames: &[Frame]) -> Vec<Option<crate::model::PoseMeasurement>> {
+    /// Measures a part's poses in the last window, about its track.
+    fn measure(&mut self, label: Label, frames: &[Frame]) {
         let settings = AlignmentSettings { gate: 0.02, ..AlignmentSettings::default() };
-        frames
+        let Some(track) = self.tracks.get(&label).and_then(|t| t.last()) else { return };
+        let faces: Vec<_> = frames
             .iter()
             .zip(track)
-            .map(|(frame, displacement)| measure(self.models.get(&label)?, frame.scans.get(&label)?, displacement, &settings))
-            .collect()
+            .map(|(frame, displacement)| match (self.models.get(&label), frame.scans.get(&label)) {
+                (Some(model), Some(scan)) => measure_faces(model, scan, displacement, &settings),
+                _ => [None; 2],
+            })
+            .collect();
+        if let Some(window) = self.windows.last_mut() {
+            window.poses.insert(label, faces.iter().map(|f| f[0]).collect());
+            window.later_faces.insert(label, faces.iter().map(|f| f[1]).collect());
+        }
     }
 
     fn part(&self, label: Label) -> EdgePart {
@@ -177,11 +207,12 @@ impl Learner {
                 }
                 let track = parent.map(|p| self.tracks[&p].as_slice());
                 let relative = relative_windows(child, track, &windows);
+                let resting = self.resting_windows(child, parent);
                 let rigid = rigid_evidence(&part, &relative, &self.settings);
                 let mut option = ParentEvidence { parent, log_evidence: [rigid; 3], fits: [None, None, None] };
                 for joint_type in [JointType::Prismatic, JointType::Revolute] {
                     let starts = self.start_axes(&part, parent, joint_type, &relative, motions);
-                    let fit = moving_evidence(&part, joint_type, &starts, &relative, &self.settings);
+                    let fit = moving_evidence(&part, joint_type, &starts, &relative, &resting, &self.settings);
                     let slot = joint_type as usize;
                     if let Some(fit) = fit {
                         option.log_evidence[slot] = option.log_evidence[slot].max(fit.log_evidence);
@@ -194,6 +225,20 @@ impl Learner {
             evidence.insert(child, options);
         }
         self.evidence = evidence;
+    }
+
+    /// The windows in which a part keeps its place on a parent, by their tracks.
+    fn resting_windows(&self, child: Label, parent: Option<Label>) -> Vec<bool> {
+        let model = &self.models[&child];
+        (0..self.windows.len())
+            .map(|w| {
+                let relative = |k: usize| {
+                    let reference = parent.map_or_else(Pose::identity, |p| self.tracks[&p][w][k].inverse());
+                    reference * self.tracks[&child][w][k]
+                };
+                (1..self.windows[w].times_s.len()).all(|k| travel(model, &relative(0), &relative(k)) < RESTS)
+            })
+            .collect()
     }
 
     /// The evidence so far, where neither part moved in the window: it adds the same to every type.
@@ -337,32 +382,39 @@ impl Learner {
         self.fit = Some(fit);
     }
 
-    /// Takes the window's measurements again, at the fitted poses.
-    fn remeasure(&mut self, job: &WindowJob) {
-        let last = self.windows.len() - 1;
-        let labels: Vec<Label> = self.joints().iter().map(|j| j.child).collect();
-        for label in labels {
-            let measured = self.measure_along(label, &self.tracks[&label][last], &job.frames);
-            self.windows[last].poses.insert(label, measured);
-        }
-    }
-
-    /// Adds what the window showed of new faces to the models.
-    fn grow(&mut self, job: &WindowJob) {
-        let last = self.windows.len() - 1;
-        for (label, tracks) in &self.tracks {
-            let track = &tracks[last];
-            if let Some(end) = track.last() {
-                self.displacements.insert(*label, *end);
-            }
-            let Some(accumulator) = self.accumulators.get_mut(label) else { continue };
-            let every = (job.frames.len() / 8).max(1);
-            for (frame, displacement) in job.frames.iter().zip(track).step_by(every) {
-                if let Some(scan) = frame.scans.get(label) {
-                    accumulator.add(scan, displacement);
+    /// Keeps scans of the parts that moved, and grows their models.
+    fn grow(&mut self, job: &WindowJob, motions: &BTreeMap<Label, Motion>) {
+        let window = self.windows.len() - 1;
+        for (label, _) in motions.iter().filter(|(_, motion)| motion.moved) {
+            let keyframes = self.keyframes.entry(*label).or_default();
+            let every = job.frames.len().div_ceil(KEYFRAMES_PER_WINDOW).max(1);
+            for (frame, content) in job.frames.iter().enumerate().step_by(every) {
+                if let Some(scan) = content.scans.get(label) {
+                    keyframes.push((window, frame, scan.clone()));
                 }
             }
-            if let Some(model) = accumulator.build() {
+            while keyframes.len() > MOST_KEYFRAMES {
+                // Thin out the older half.
+                let mut index = 0;
+                let half = keyframes.len() / 2;
+                keyframes.retain(|_| {
+                    index += 1;
+                    index > half || index % 2 == 0
+                });
+            }
+        }
+        self.rebuild_models();
+    }
+
+    /// Models of the moving parts, from the first look and the keyframes where the fit has them now.
+    fn rebuild_models(&mut self) {
+        for (label, keyframes) in &self.keyframes {
+            let mut later = SurfelAccumulator::default();
+            for (window, frame, scan) in keyframes {
+                later.add(scan, &self.tracks[label][*window][*frame]);
+            }
+            let reference = self.reference.get(label).map_or(&[][..], Vec::as_slice);
+            if let Some(model) = PartModel::new(reference, &later.surfels()) {
                 self.models.insert(*label, model);
             }
         }

@@ -15,7 +15,7 @@ pub use windows::{FrameAssembler, WindowCutter, WindowSettings};
 
 use crate::math::Pose;
 use crate::model::{KinematicSettings, PoseMeasurement};
-use crate::registration::{AlignmentSettings, SurfelAccumulator, align, truncated_cost};
+use crate::registration::{AlignmentSettings, Quadratic, SurfelAccumulator, align, truncated_cost};
 use crate::types::{Input, Label, Stamp};
 use explain::{FEWEST_POINTS, measurement_of, travel};
 use windows::frame_of;
@@ -201,7 +201,8 @@ impl Pipeline {
                 let r = model.radius;
                 let prior = Matrix6::from_diagonal(&(Vector6::new(r * r, r * r, r * r, 1.0, 1.0, 1.0) * 2.5e3));
                 let aligned = align(model, scan, &last, &prior, &settings, 6);
-                measurement = measurement_of(model, &aligned.factor, &aligned.displacement);
+                let whole = Quadratic { hessian: aligned.factor.hessian(), gradient: aligned.factor.gradient() };
+                measurement = measurement_of(model, &whole, &aligned.displacement);
                 self.current.insert(*label, measurement.displacement);
             }
             outputs.push(Output::Observation { time_s: frame.time_s, label: *label, measurement });

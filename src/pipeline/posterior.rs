@@ -43,7 +43,7 @@ impl Pipeline {
     /// Points of each part's surface at the reference configuration \[m\].
     fn points(&self) -> BTreeMap<Label, Vec<Vector3<f64>>> {
         if let Some(learner) = &self.learner {
-            return learner.accumulators.iter().map(|(label, a)| (*label, a.voxel_means(1.0))).collect();
+            return learner.models.iter().map(|(label, model)| (*label, model.surfels.iter().map(|s| s.point).collect())).collect();
         }
         let mut points: BTreeMap<Label, Vec<Vector3<f64>>> = BTreeMap::new();
         let last = self.reference.last().into_iter().flat_map(|frame| &frame.scans);

@@ -36,8 +36,8 @@ pub fn align(
     let mut cost = factor.cost;
     let mut converged = false;
     for _ in 0..steps {
-        let Some(cholesky) = (factor.hessian + prior).cholesky() else { break };
-        let step = -cholesky.solve(&(factor.gradient + prior * xi));
+        let Some(cholesky) = (factor.hessian() + prior).cholesky() else { break };
+        let step = -cholesky.solve(&(factor.gradient() + prior * xi));
         let mut fraction = 1.0;
         let mut improved = false;
         for _ in 0..4 {

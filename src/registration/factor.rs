@@ -31,13 +31,20 @@ impl Default for AlignmentSettings {
     }
 }
 
+/// A quadratic in ξ: curvature and gradient, (angular, linear).
+#[derive(Clone, Copy, Debug)]
+pub struct Quadratic {
+    /// Curvature.
+    pub hessian: Matrix6<f64>,
+    /// Gradient.
+    pub gradient: Vector6<f64>,
+}
+
 /// Quadratic model of a scan's cost about one pose.
 #[derive(Clone, Debug)]
 pub struct PoseFactor {
-    /// Curvature in ξ, (angular, linear).
-    pub hessian: Matrix6<f64>,
-    /// Gradient in ξ.
-    pub gradient: Vector6<f64>,
+    /// By faces: those of the first look, and those that came into view later.
+    pub faces: [Quadratic; 2],
     /// Robust cost: negative log likelihood up to a constant.
     pub cost: f64,
     /// Points that matched.
@@ -47,6 +54,18 @@ pub struct PoseFactor {
 }
 
 impl PoseFactor {
+    /// Curvature over all faces.
+    pub fn hessian(&self) -> Matrix6<f64> {
+        self.faces[0].hessian + self.faces[1].hessian
+    }
+
+    /// Gradient over all faces.
+    pub fn gradient(&self) -> Vector6<f64> {
+        self.faces[0].gradient + self.faces[1].gradient
+    }
+}
+
+impl Quadratic {
     /// The information that the scan holds once what rough normals pretend to hold is taken off.
     ///
     /// Rotations are scaled by the model's `radius` \[m\] and each eigenvalue λ becomes
@@ -65,8 +84,7 @@ impl PoseFactor {
 /// The factor of a scan at a pose.
 pub fn pose_factor(model: &PartModel, scan: &[ScanPoint], displacement: &Pose, settings: &AlignmentSettings) -> PoseFactor {
     let mut factor = PoseFactor {
-        hessian: Matrix6::zeros(),
-        gradient: Vector6::zeros(),
+        faces: [Quadratic { hessian: Matrix6::zeros(), gradient: Vector6::zeros() }; 2],
         cost: 0.0,
         matched: 0,
         points: scan.len(),
@@ -87,12 +105,14 @@ pub fn pose_factor(model: &PartModel, scan: &[ScanPoint], displacement: &Pose, s
         }
         factor.matched += 1;
         let arm = y - model.centroid;
-        add_residual(&mut factor, e, surfel.sigma, &surfel.normal, &arm, settings.student_freedom);
+        factor.cost += add_residual(&mut factor.faces[usize::from(surfel.grown)], e, surfel.sigma, &surfel.normal, &arm, settings.student_freedom);
         let along = offset - surfel.normal * e;
         let distance = along.norm();
         if distance > BOUNDARY_SLACK && settings.boundary_sigma.is_finite() {
             let direction = along / distance;
-            add_residual(&mut factor, distance - BOUNDARY_SLACK, settings.boundary_sigma, &direction, &arm, settings.student_freedom);
+            let face = &mut factor.faces[usize::from(surfel.grown)];
+            factor.cost +=
+                add_residual(face, distance - BOUNDARY_SLACK, settings.boundary_sigma, &direction, &arm, settings.student_freedom);
         }
     }
     factor
@@ -130,12 +150,13 @@ fn matching_surfel(model: &PartModel, scan_point: &ScanPoint, y: &Vector3<f64>, 
     second.map(|index| index as usize).filter(|&index| faces(index))
 }
 
-fn add_residual(factor: &mut PoseFactor, e: f64, sigma: f64, direction: &Vector3<f64>, arm: &Vector3<f64>, freedom: f64) {
+/// Adds a residual along a direction at an arm from the centroid; returns its cost.
+fn add_residual(face: &mut Quadratic, e: f64, sigma: f64, direction: &Vector3<f64>, arm: &Vector3<f64>, freedom: f64) -> f64 {
     let normalized = e / sigma;
     let weight = (freedom + 1.0) / (freedom + normalized * normalized) / (sigma * sigma);
-    factor.cost += 0.5 * (freedom + 1.0) * (normalized * normalized / freedom).ln_1p();
     let moment = arm.cross(direction);
     let jacobian = -Vector6::new(moment.x, moment.y, moment.z, direction.x, direction.y, direction.z);
-    factor.hessian += jacobian * (jacobian * weight).transpose();
-    factor.gradient += jacobian * (weight * e);
+    face.hessian += jacobian * (jacobian * weight).transpose();
+    face.gradient += jacobian * (weight * e);
+    0.5 * (freedom + 1.0) * (normalized * normalized / freedom).ln_1p()
 }

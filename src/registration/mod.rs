@@ -14,7 +14,7 @@ mod surfels;
 
 pub use align::{Alignment, align};
 pub use articulated::{JointFrame, JointPath, search_path};
-pub use factor::{AlignmentSettings, OUTLIER_COST, PoseFactor, pose_factor, truncated_cost};
+pub use factor::{AlignmentSettings, OUTLIER_COST, PoseFactor, Quadratic, pose_factor, truncated_cost};
 pub use field::NearestField;
 pub use seeds::{AxisSeed, fit_circle, fit_line, geometric_seeds};
 pub use surfels::{PartModel, Surfel, SurfelAccumulator};

@@ -17,6 +17,10 @@ const NORMAL_RADIUS: f64 = 0.045;
 const SNAP_COSINE: f64 = 0.94;
 /// A plane needs this many surfels to snap others to it.
 const PLANE_SURFELS: usize = 20;
+/// A part needs this many surfels to be registered.
+const FEWEST_SURFELS: usize = 20;
+/// A later surfel this far from those of the first look is a new face \[m\].
+const NEW_FACE_DISTANCE: f64 = 0.015;
 /// Viewing directions are told apart by the nearest of the 12 vertices of an icosahedron.
 const GOLDEN: f64 = 1.618_033_988_749_895;
 /// A voxel's mean gains nothing from more points than this; it also bounds drift of old sums.
@@ -33,6 +37,8 @@ pub struct Surfel {
     pub sigma: f64,
     /// Whether the viewing side is known.
     pub sided: bool,
+    /// Whether it was first seen after the part had moved, and so stands where the fit put it.
+    pub grown: bool,
 }
 
 #[derive(Clone, Debug, Default)]
@@ -84,8 +90,8 @@ impl SurfelAccumulator {
         self.voxels.values().filter(|v| v.count >= least).map(|v| v.sum / v.count).collect()
     }
 
-    /// The surfel model of everything added so far; `None` with fewer than `PLANE_SURFELS` surfels.
-    pub fn build(&self) -> Option<PartModel> {
+    /// The surfels of everything added so far.
+    pub fn surfels(&self) -> Vec<Surfel> {
         let least = 1.0;
         let mut surfels = Vec::new();
         let mut sides: Vec<u8> = self.voxels.keys().map(|(side, _)| *side).collect();
@@ -96,7 +102,7 @@ impl SurfelAccumulator {
             snap_to_planes(&mut side_surfels);
             surfels.append(&mut side_surfels);
         }
-        (surfels.len() >= PLANE_SURFELS).then(|| PartModel::new(surfels))
+        surfels
     }
 
     fn surfels_of_side(&self, side: u8, view: Option<&Vector3<f64>>, least: f64) -> Vec<Surfel> {
@@ -141,6 +147,7 @@ impl SurfelAccumulator {
                 normal,
                 sigma: spread[0].max(0.0).sqrt().clamp(0.001, 0.020),
                 sided: view.is_some(),
+                grown: false,
             });
         }
         surfels
@@ -239,8 +246,29 @@ pub struct PartModel {
 }
 
 impl PartModel {
-    /// A model of the given surfels.
-    pub fn new(surfels: Vec<Surfel>) -> Self {
+    /// A model of surfels seen at the reference configuration, and of those that came into view
+    /// later where the first have none. `None` with too few of the first.
+    pub fn new(reference: &[Surfel], later: &[Surfel]) -> Option<Self> {
+        if reference.len() < FEWEST_SURFELS {
+            return None;
+        }
+        let first = Self::of(reference.to_vec());
+        let new_face = |surfel: &&Surfel| {
+            first.field.nearest(&surfel.point).into_iter().flatten().all(|index| {
+                let near = &first.surfels[index as usize];
+                let same_side = !near.sided || near.normal.dot(&surfel.normal) > 0.5;
+                !same_side || (near.point - surfel.point).norm() > NEW_FACE_DISTANCE
+            })
+        };
+        let grown: Vec<Surfel> = later.iter().filter(new_face).map(|s| Surfel { grown: true, ..*s }).collect();
+        if grown.is_empty() {
+            return Some(first);
+        }
+        let (centroid, radius) = (first.centroid, first.radius);
+        Some(Self { centroid, radius, ..Self::of([reference, &grown].concat()) })
+    }
+
+    fn of(surfels: Vec<Surfel>) -> Self {
         let count = surfels.len().max(1) as f64;
         let centroid = surfels.iter().map(|s| s.point).sum::<Vector3<f64>>() / count;
         let variance = surfels.iter().map(|s| (s.point - centroid).norm_squared()).sum::<f64>() / count;
