@@ -1,7 +1,8 @@
 //! The replay of a bag: what it writes can be read, and depends on nothing that means nothing.
 //!
-//! Record A == replay(A): two runs write the same bytes, wall times apart. New numbers for the labels
-//! change the posterior's names, not what it says.
+//! Record A == replay(A): two runs write the same bytes, wall times apart. New numbers for the labels,
+//! or a rigid motion of the world with gravity in it, change the posterior's names and axes, not
+//! what it says.
 #![allow(clippy::unwrap_used)]
 
 mod command;
@@ -17,8 +18,9 @@ use bayesian_object_models::{
     io::{
         bag::{Bag, BagWriter},
         cdr::{self, Endianness},
+        config::Config,
         document::PosteriorDocument,
-        messages::{POINT_CLOUD_TYPE, PointCloud2},
+        messages::{POINT_CLOUD_TYPE, PointCloud2, RawTransform, TF_TYPE, TfMessage},
     },
     math::Pose,
     types::{
@@ -27,7 +29,7 @@ use bayesian_object_models::{
     },
 };
 use command::{bom, ours};
-use nalgebra::Vector3;
+use nalgebra::{UnitQuaternion, Vector3};
 use tempfile::TempDir;
 
 const ROOT: u32 = 4;
@@ -98,6 +100,12 @@ fn with_permuted_labels(cloud: &mut PointCloud2) {
         let label = u32::from_le_bytes(point[offset..offset + 4].try_into().unwrap());
         point[offset..offset + 4].copy_from_slice(&permuted(Label(label)).0.to_le_bytes());
     }
+}
+
+/// The new world's frame : what stood at x stands at `moved() · x`.
+fn moved() -> Pose {
+    let rotation = UnitQuaternion::from_euler_angles(0.3, -0.7, 1.9);
+    Pose::from_quaternion(&rotation, Vector3::new(1.7, -2.3, 0.4))
 }
 
 fn vector(x: [f64; 3]) -> Vector3<f64> {
@@ -276,6 +284,30 @@ fn permuted_labels_give_the_same_posterior() {
     });
     let (posterior, _) = replay(&bag, permuted(Label(ROOT)).0, None);
     assert_same(&parse(&ORIGINAL.0), &parse(&posterior), permuted, &Pose::identity());
+}
+
+#[test]
+fn a_moved_world_gives_the_same_posterior() {
+    let folder = tempfile::tempdir().unwrap();
+    let moved = moved();
+    let bag = rewritten(&folder, |_, type_name, bytes| {
+        if type_name != TF_TYPE {
+            return bytes.to_vec();
+        }
+        let mut message: TfMessage = cdr::decode(bytes).unwrap();
+        for transform in message.transforms.iter_mut().filter(|t| t.header.frame_id == "world") {
+            let q = transform.transform.rotation;
+            let rotation = UnitQuaternion::from_quaternion(nalgebra::Quaternion::new(q.w, q.x, q.y, q.z));
+            let old = Pose::from_quaternion(&rotation, transform.transform.translation.into());
+            transform.transform = RawTransform::from(moved * old);
+        }
+        encode(&message)
+    });
+    let gravity = moved.rotation * Vector3::from(Config::default().gravity_m_s2);
+    let config = folder.path().join("gravity.yaml");
+    fs::write(&config, format!("gravity_m_s2: {:?}\n", gravity.as_slice())).unwrap();
+    let (posterior, _) = replay(&bag, ROOT, Some(&config));
+    assert_same(&parse(&ORIGINAL.0), &parse(&posterior), |label| label, &moved);
 }
 
 #[test]

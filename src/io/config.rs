@@ -81,6 +81,7 @@ impl Config {
             use_tool: self.observations.tool_pose,
             windows: self.windows,
             kinematics: self.kinematics,
+            gravity_in_world: self.gravity_m_s2.into(),
         }
     }
 

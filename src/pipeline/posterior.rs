@@ -22,8 +22,8 @@ const HULL_DENSITY: (f64, f64) = (250.0, 0.9);
 const CENTER_SHARE: f64 = 0.3;
 
 impl Pipeline {
-    /// What is believed now; before the first window, the prior. `None` while no part was seen.
-    pub fn posterior(&self) -> Option<ObjectPosterior> {
+    /// What is believed now, in the working frame.
+    pub(super) fn posterior_in_work(&self) -> Option<ObjectPosterior> {
         let points = self.points();
         let root = match (&self.learner, self.settings.root) {
             (Some(learner), _) => learner.root,

@@ -5,9 +5,11 @@
 
 use std::collections::BTreeMap;
 
+use nalgebra::{Matrix2, Matrix3, Matrix4, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::Label;
+use crate::math::{Pose, orthonormal_pair};
 
 /// z of a standard normal at 95 %: a central 90 % interval is ± this many standard deviations.
 const Z_95: f64 = 1.644_853_626_951_472_2;
@@ -30,6 +32,48 @@ pub struct ObjectPosterior {
 impl ObjectPosterior {
     /// Edges below it are left out.
     pub const LEAST_PROBABILITY: f64 = 1e-6;
+
+    /// The same in another frame: what stands at x here stands at `to_from_here · x` there.
+    #[must_use]
+    pub fn carried_by(mut self, to_from_here: &Pose) -> Self {
+        let rotation = to_from_here.rotation;
+        let point = |p: [f64; 3]| to_from_here.transform_point(&p.into()).into();
+        for part in &mut self.parts {
+            part.com_in_world_m = point(part.com_in_world_m);
+            // Matrices are symmetric, so that rows and columns are the same.
+            part.com_covariance_m2 = (rotation * Matrix3::from(part.com_covariance_m2) * rotation.transpose()).into();
+        }
+        for edge in &mut self.edges {
+            if let Some(axis) = &mut edge.revolute {
+                let (direction, basis) = turned_axis(&axis.axis_direction, &rotation);
+                let mut both = Matrix4::zeros();
+                both.fixed_view_mut::<2, 2>(0, 0).copy_from(&basis);
+                both.fixed_view_mut::<2, 2>(2, 2).copy_from(&basis);
+                axis.axis_direction = direction;
+                axis.axis_point_m = point(axis.axis_point_m);
+                axis.covariance = (both * Matrix4::from(axis.covariance) * both.transpose()).into();
+            }
+            if let Some(axis) = &mut edge.prismatic {
+                let (direction, basis) = turned_axis(&axis.axis_direction, &rotation);
+                axis.axis_direction = direction;
+                axis.covariance = (basis * Matrix2::from(axis.covariance) * basis.transpose()).into();
+            }
+        }
+        self
+    }
+}
+
+/// An axis's direction, turned, and what takes components across the old one, turned with it, to
+/// components across the new one: [`orthonormal_pair`] chooses by the frame's axes.
+fn turned_axis(direction: &[f64; 3], rotation: &Matrix3<f64>) -> ([f64; 3], Matrix2<f64>) {
+    let old = Vector3::from(*direction);
+    let new = rotation * old;
+    let (first, second) = orthonormal_pair(&old);
+    let (first, second) = (rotation * first, rotation * second);
+    let (new_first, new_second) = orthonormal_pair(&new);
+    let basis =
+        Matrix2::new(new_first.dot(&first), new_first.dot(&second), new_second.dot(&first), new_second.dot(&second));
+    (new.into(), basis)
 }
 
 /// What is believed of one part by itself.
@@ -102,7 +146,8 @@ pub struct RevoluteAxis {
     pub axis_direction: [f64; 3],
     /// The point of the axis nearest the child's centre of mass \[m\].
     pub axis_point_m: [f64; 3],
-    /// Of two directions across the axis \[rad\], then two positions across it \[m\].
+    /// Of two directions across the axis \[rad\], then two positions across it \[m\], along the pair
+    /// of [`orthonormal_pair`]. A direction's component is the rotation about that unit vector.
     pub covariance: [[f64; 4]; 4],
 }
 
