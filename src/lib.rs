@@ -16,6 +16,7 @@
 //! `model`, `pipeline`, `io`, `report`.
 
 pub mod geometry;
+pub mod inference;
 pub mod io;
 pub mod math;
 pub mod mechanism;

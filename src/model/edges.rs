@@ -97,6 +97,7 @@ pub fn rigid_evidence(part: &EdgePart, windows: &[WindowObservations], settings:
         axis: Axis { direction: Vector3::z(), point: part.center },
         center: part.center,
         radius: part.radius,
+        suggested: None,
     };
     let references: Vec<&WindowObservations> = windows.iter().collect();
     let positions = windows.iter().map(|w| vec![vec![0.0; w.times_s.len()]]).collect();
@@ -126,6 +127,7 @@ pub fn moving_evidence(
                 axis: Axis { direction: axis.direction, point: axis.point + axis.direction * along },
                 center: part.center,
                 radius: part.radius,
+                suggested: None,
             };
             let positions =
                 windows.iter().zip(resting).map(|(w, rests)| vec![start_positions(&joint, w, *rests)]).collect();

@@ -22,6 +22,14 @@ use crate::types::Label;
 /// Standard deviation of the pose at which later faces were added to a model \[m\].
 const FACE_ERROR_SIGMA: f64 = 0.020;
 
+/// How closely axes follow the faces they are aligned with \[rad\].
+const ALIGNED_SIGMA: f64 = 0.007;
+/// A window is tested for motion in this many blocks of frames.
+const REST_BLOCKS: usize = 6;
+/// Score at which rest is given up: far beyond χ² with `REST_BLOCKS` degrees of freedom, as frames
+/// are not independent.
+const REST_SCORE: f64 = 40.0;
+
 /// A joint axis in world at the reference configuration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Axis {
@@ -46,6 +54,8 @@ pub struct KinematicJoint {
     pub center: Vector3<f64>,
     /// Length that makes rotations of the child comparable with translations \[m\].
     pub radius: f64,
+    /// The nearest direction that the shape suggests for the axis (a face's normal), if any.
+    pub suggested: Option<Vector3<f64>>,
 }
 
 impl KinematicJoint {
@@ -71,6 +81,24 @@ impl KinematicJoint {
     /// hinge touches the part it carries.
     pub fn axis_point_prior(&self) -> f64 {
         2.0 * self.radius + 0.05
+    }
+
+    /// Rotation that takes the axis to the suggested direction, in the axis's own tangent
+    /// coordinates \[rad\], with the information of that suggestion.
+    ///
+    /// Mechanisms are mostly built along faces, but not always: with even odds the axis is within
+    /// `ALIGNED_SIGMA` of the suggestion, or anywhere. `spread` is the variance of the direction by
+    /// the data alone \[rad²\].
+    fn alignment(&self, spread: f64) -> Option<([f64; 2], f64)> {
+        let suggested = self.suggested?;
+        let suggested = suggested * suggested.dot(&self.axis.direction).signum();
+        let turn = self.axis.direction.cross(&suggested);
+        let (first, second) = orthonormal_pair(&self.axis.direction);
+        let angle_squared = turn.norm_squared();
+        let variance = ALIGNED_SIGMA.powi(2) + spread;
+        let log_odds = -0.5 * angle_squared / variance - variance.ln();
+        let share = 1.0 / (1.0 + (-log_odds).exp());
+        Some(([turn.dot(&first), turn.dot(&second)], share / ALIGNED_SIGMA.powi(2)))
     }
 
     /// The axis's tangent twists: two rotations about its point, then two translations across it.
@@ -119,7 +147,7 @@ impl Default for KinematicSettings {
     fn default() -> Self {
         Self {
             tool_offset_sigma: 0.003,
-            shared_error: 0.0015,
+            shared_error: 0.003,
             shared_distance: 0.010,
             rest_deviations: 2.0,
             steps: 15,
@@ -189,12 +217,15 @@ pub fn fit_kinematics(
     for step in 0..settings.steps {
         if step == settings.steps / 2 || (converged && !tied) {
             problem.share_errors();
+            problem.free_movers();
             problem.tie_rests();
             tied = true;
             converged = false;
             cost = problem.cost();
         }
         let systems = problem.linearize();
+        problem.weigh_alignments(&systems);
+        cost = problem.cost();
         let mut accepted = false;
         for _ in 0..6 {
             let trial = problem.stepped(&systems, damping);
@@ -242,6 +273,8 @@ struct Problem<'a> {
     information: Rc<Vec<Vec<Vec<[Option<Matrix6<f64>>; 2]>>>>,
     /// By joint: the rigid error of the faces that its child showed later, as ξ about the center.
     face_errors: Vec<Vector6<f64>>,
+    /// By joint: information of the suggested direction \[rad⁻²\].
+    alignments: Vec<f64>,
     contact_points: Vec<Vec<Vector3<f64>>>,
     tool_offset: Vector3<f64>,
     by_label: BTreeMap<Label, usize>,
@@ -264,10 +297,12 @@ impl<'a> Problem<'a> {
             slot_counts: Vec::new(),
             information: Rc::default(),
             face_errors: Vec::new(),
+            alignments: Vec::new(),
             contact_points: Vec::new(),
             tool_offset: Vector3::zeros(),
             by_label,
         };
+        problem.alignments = vec![0.0; problem.joints.len()];
         problem.face_errors = vec![Vector6::zeros(); problem.joints.len()];
         problem.separate_frames();
         problem.information = Rc::new(problem.informations(|_, _, _| 1.0));
@@ -359,6 +394,10 @@ impl<'a> Problem<'a> {
 
     fn cost(&self) -> f64 {
         let mut cost = 0.5 * self.tool_offset.norm_squared() / self.settings.tool_offset_sigma.powi(2);
+        for (joint, information) in self.joints.iter().zip(&self.alignments) {
+            let turn = joint.alignment(0.0).map_or([0.0; 2], |(turn, _)| turn);
+            cost += 0.5 * information * (turn[0] * turn[0] + turn[1] * turn[1]);
+        }
         for (j, error) in self.face_errors.iter().enumerate() {
             cost += 0.5 * error.component_mul(error).dot(&self.face_error_information(j));
         }
@@ -493,13 +532,20 @@ impl<'a> Problem<'a> {
         let mut matrix = DMatrix::zeros(globals, globals);
         let mut gradient = DVector::zeros(globals);
         let mut at = 0;
-        for joint in &self.joints {
+        for (j, joint) in self.joints.iter().enumerate() {
             let arm = joint.axis.point - joint.center;
             let (first, second) = orthonormal_pair(&joint.axis.direction);
             for (i, pull) in [0.0, 0.0, arm.dot(&first), arm.dot(&second)].into_iter().take(joint.axis_parameters()).enumerate() {
                 let information = if i < 2 { 1.0 } else { joint.axis_point_prior().powi(-2) };
                 matrix[(at + i, at + i)] += information;
                 gradient[at + i] += information * pull;
+            }
+            if let Some((turn, _)) = joint.alignment(0.0) {
+                let information = self.alignments[j];
+                for (i, turn) in turn.into_iter().enumerate().take(joint.axis_parameters()) {
+                    matrix[(at + i, at + i)] += information;
+                    gradient[at + i] -= information * turn;
+                }
             }
             at += joint.axis_parameters();
         }
@@ -535,6 +581,24 @@ impl<'a> Problem<'a> {
             solves.push(solve);
         }
         (matrix, gradient, solves)
+    }
+
+    /// Weighs the suggested directions against what the data alone say of each axis.
+    fn weigh_alignments(&mut self, systems: &[WindowSystem]) {
+        self.alignments.fill(0.0);
+        if self.joints.iter().all(|joint| joint.suggested.is_none()) {
+            return;
+        }
+        let (matrix, _, _) = self.reduced(systems, 0.0);
+        let Some(covariance) = matrix.cholesky().map(|c| c.inverse()) else { return };
+        let mut at = 0;
+        for (j, joint) in self.joints.iter().enumerate() {
+            if joint.axis_parameters() > 0 {
+                let spread = 0.5 * (covariance[(at, at)] + covariance[(at + 1, at + 1)]);
+                self.alignments[j] = joint.alignment(spread).map_or(0.0, |(_, information)| information);
+            }
+            at += joint.axis_parameters();
+        }
     }
 
     fn stepped(&self, systems: &[WindowSystem], damping: f64) -> Self {
@@ -592,6 +656,49 @@ impl<'a> Problem<'a> {
             }
         }
         self.information = Rc::new(self.informations(|w, j, frame| sharing.get(&(w, j, frame)).copied().unwrap_or(1.0)));
+    }
+
+    /// Frees joints that were taken to rest through a window where the data object: a score test on
+    /// blocks of frames, Σ g²/h against χ².
+    fn free_movers(&mut self) {
+        for w in 0..self.windows.len() {
+            let frames = self.windows[w].times_s.len();
+            let tied: Vec<usize> = (0..self.joints.len())
+                .filter(|&j| frames > 1 && self.slots[w][j].windows(2).all(|pair| pair[0] == pair[1]))
+                .collect();
+            if tied.is_empty() {
+                continue;
+            }
+            let mut freed = self.clone();
+            let mut next = freed.slot_counts[w];
+            for &j in &tied {
+                for slot in &mut freed.slots[w][j] {
+                    *slot = next;
+                    next += 1;
+                }
+            }
+            freed.slot_counts[w] = next;
+            let system = freed.linearize_window(w);
+            let moves = |j: usize| {
+                let block = frames.div_ceil(REST_BLOCKS);
+                let score: f64 = freed.slots[w][j]
+                    .chunks(block)
+                    .map(|slots| {
+                        let g: f64 = slots.iter().map(|&s| system.local_gradient[s]).sum();
+                        let h: f64 = slots.iter().map(|&s| system.local[(s, s)]).sum();
+                        g * g / h
+                    })
+                    .sum();
+                score > REST_SCORE
+            };
+            for &j in &tied {
+                if moves(j) {
+                    let next = self.slot_counts[w];
+                    self.slots[w][j] = (next..next + frames).collect();
+                    self.slot_counts[w] += frames;
+                }
+            }
+        }
     }
 
     /// Makes frames in which a joint rests one unknown: friction holds what is not pushed.

@@ -290,6 +290,7 @@ impl Scene<'_> {
             axis: Axis { direction: seed.direction, point: point + seed.direction * seed.direction.dot(&(center - point)) },
             center,
             radius: model.radius,
+            suggested: None,
         };
         let contact = self.contact(label);
         let contact_point = contact.and_then(|c| {

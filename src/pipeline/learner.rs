@@ -7,6 +7,8 @@ use nalgebra::{DMatrix, Vector3};
 use super::explain::{Frame, Motion, Scene, explain_window, measure_faces, travel};
 use crate::math::Pose;
 use crate::mechanism::JointType;
+use crate::geometry::{HullProperties, hull_properties};
+use crate::model::{DynamicsInput, DynamicsLearner, WindowInference};
 use crate::model::{
     Axis, Contact, EdgeFit, EdgePart, KinematicFit, KinematicJoint, KinematicSettings, WindowObservations, axes_from_motion,
     fit_kinematics, moving_evidence, relative_windows, rigid_evidence,
@@ -20,6 +22,8 @@ const MOVED: f64 = 0.006;
 
 /// A part that stays within this of its place on its parent rests there \[m\].
 const RESTS: f64 = 1e-6;
+/// A face's normal suggests an axis within 15° of it.
+const SUGGESTION_COSINE: f64 = 0.966;
 /// Scans kept from each window for growing a part's model, and in all.
 const KEYFRAMES_PER_WINDOW: usize = 10;
 const MOST_KEYFRAMES: usize = 40;
@@ -33,6 +37,8 @@ pub struct WindowJob {
     pub contacts: Vec<Contact>,
     /// Wrench readings from before the window to after it.
     pub wrenches: Vec<AppliedWrench>,
+    /// Time zero.
+    pub zero: crate::types::Stamp,
 }
 
 /// Evidence for one parent of a part.
@@ -72,6 +78,12 @@ pub struct Learner {
     pub fit: Option<KinematicFit>,
     /// Kinematic assumptions.
     pub settings: KinematicSettings,
+    /// Friction, damping, inertia and end stops.
+    pub dynamics: DynamicsLearner,
+    /// What learning each window's dynamics gave.
+    pub inferences: Vec<WindowInference>,
+    /// Hulls of the parts, as first seen.
+    pub hulls: BTreeMap<Label, HullProperties>,
 }
 
 impl Learner {
@@ -92,6 +104,9 @@ impl Learner {
             evidence: BTreeMap::new(),
             fit: None,
             settings: KinematicSettings::default(),
+            dynamics: DynamicsLearner::new(Vector3::new(0.0, 0.0, -9.81)),
+            inferences: Vec::new(),
+            hulls: BTreeMap::new(),
         }
     }
 
@@ -158,6 +173,20 @@ impl Learner {
                 self.displacements.insert(*label, *end);
             }
         }
+        self.learn_dynamics(job);
+    }
+
+    fn learn_dynamics(&mut self, job: &WindowJob) {
+        for (label, model) in &self.models {
+            let points: Vec<Vector3<f64>> = model.surfels.iter().map(|s| s.point).collect();
+            if let Some(hull) = hull_properties(&points, None) {
+                self.hulls.insert(*label, hull);
+            }
+        }
+        let Some(fit) = &self.fit else { return };
+        let windows: Vec<&WindowObservations> = self.windows.iter().collect();
+        let input = DynamicsInput { windows: &windows, contacts: &job.contacts, zero: job.zero, parts: &self.hulls, use_tool: self.use_tool };
+        self.inferences.push(self.dynamics.learn_window(fit, &input));
     }
 
     /// Measures a part's poses in the last window, about its track.
@@ -349,6 +378,7 @@ impl Learner {
                     axis: *axis,
                     center: part.center,
                     radius: part.radius,
+                    suggested: self.suggested_direction(*child, *parent, &axis.direction),
                 }
             })
             .collect();
@@ -380,6 +410,25 @@ impl Learner {
             }
         }
         self.fit = Some(fit);
+    }
+
+    /// The direction nearest to an axis among the normals of the faces of the part, its parent and the
+    /// root, and their common perpendiculars; `None` beyond 15°.
+    fn suggested_direction(&self, child: Label, parent: Option<Label>, axis: &Vector3<f64>) -> Option<Vector3<f64>> {
+        let labels = [Some(child), parent, Some(self.root)];
+        let mut candidates = Vec::new();
+        for label in labels.into_iter().flatten() {
+            let normals = self.models.get(&label).map(PartModel::face_normals).unwrap_or_default();
+            for (i, first) in normals.iter().enumerate() {
+                candidates.push(*first);
+                candidates.extend(normals[..i].iter().filter_map(|second| {
+                    let cross = first.cross(second);
+                    (cross.norm() > 0.98).then(|| cross.normalize())
+                }));
+            }
+        }
+        let nearest = candidates.into_iter().max_by(|a, b| a.dot(axis).abs().total_cmp(&b.dot(axis).abs()))?;
+        (nearest.dot(axis).abs() > SUGGESTION_COSINE).then_some(nearest)
     }
 
     /// Keeps scans of the parts that moved, and grows their models.

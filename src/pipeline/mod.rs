@@ -15,7 +15,7 @@ pub use learner::{Learner, ParentEvidence, WindowJob};
 pub use windows::{FrameAssembler, WindowCutter, WindowSettings};
 
 use crate::math::Pose;
-use crate::model::{KinematicSettings, PoseMeasurement};
+use crate::model::{DynamicsLearner, KinematicSettings, PoseMeasurement};
 use crate::registration::{AlignmentSettings, Quadratic, SurfelAccumulator, align, truncated_cost};
 use crate::types::{Input, Label, Stamp};
 use explain::{FEWEST_POINTS, measurement_of, travel};
@@ -170,6 +170,7 @@ impl Pipeline {
         });
         let mut learner = Learner::new(root, self.settings.use_tool, accumulators);
         learner.settings = self.settings.kinematics;
+        learner.dynamics = DynamicsLearner::new(self.gravity_in_work());
         learner.calibrate(&self.reference);
         self.reference.clear();
         self.learner = Some(learner);

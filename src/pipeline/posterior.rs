@@ -7,7 +7,7 @@ use nalgebra::{DMatrix, Matrix3, Vector3};
 use super::{Learner, ParentEvidence, Pipeline};
 use crate::geometry::hull_properties;
 use crate::mechanism::JointType;
-use crate::model::Axis;
+use crate::model::{Axis, DynamicsPosterior, JointDynamics, KinematicFit, WindowInference, WindowObservations};
 use crate::structure::TreeDistribution;
 use crate::types::Label;
 use crate::types::posterior::{
@@ -31,11 +31,21 @@ impl Pipeline {
             (None, None) => points.iter().max_by_key(|(_, points)| points.len()).map(|(label, _)| *label)?,
         };
         let labels: Vec<Label> = points.keys().copied().collect();
+        let mut parts: Vec<PartPosterior> = points.iter().filter_map(|(label, points)| part(*label, points)).collect();
+        let dynamics = self.learner.as_ref().and_then(|learner| learner.dynamics.posterior().ok());
+        for learned in dynamics.iter().flat_map(|dynamics| &dynamics.parts) {
+            if let Some(part) = parts.iter_mut().find(|part| part.label == learned.label) {
+                part.com_in_world_m = learned.com_in_world.into();
+                part.com_covariance_m2 = learned.com_covariance.into();
+                part.mass_kg = learned.mass.clone();
+            }
+        }
+        let known = self.learner.as_ref().map(|learner| Known { learner, dynamics: dynamics.as_ref() });
         Some(ObjectPosterior {
             root_label: root,
-            parts: points.iter().filter_map(|(label, points)| part(*label, points)).collect(),
-            edges: edges(root, &labels, self.learner.as_ref()),
-            windows: self.learner.iter().flat_map(|learner| &learner.windows).map(window_record).collect(),
+            parts,
+            edges: edges(root, &labels, known),
+            windows: self.learner.as_ref().map(window_records).unwrap_or_default(),
             criticism: Criticism::insufficient(),
         })
     }
@@ -43,7 +53,11 @@ impl Pipeline {
     /// Points of each part's surface at the reference configuration \[m\].
     fn points(&self) -> BTreeMap<Label, Vec<Vector3<f64>>> {
         if let Some(learner) = &self.learner {
-            return learner.models.iter().map(|(label, model)| (*label, model.surfels.iter().map(|s| s.point).collect())).collect();
+            return learner
+                .models
+                .iter()
+                .map(|(label, model)| (*label, model.surfels.iter().map(|s| s.point).collect()))
+                .collect();
         }
         let mut points: BTreeMap<Label, Vec<Vector3<f64>>> = BTreeMap::new();
         let last = self.reference.last().into_iter().flat_map(|frame| &frame.scans);
@@ -68,24 +82,39 @@ fn part(label: Label, points: &[Vector3<f64>]) -> Option<PartPosterior> {
     })
 }
 
-fn window_record(window: &crate::model::WindowObservations) -> WindowRecord {
+/// What the edges are made of.
+#[derive(Clone, Copy)]
+struct Known<'a> {
+    learner: &'a Learner,
+    dynamics: Option<&'a DynamicsPosterior>,
+}
+
+fn window_records(learner: &Learner) -> Vec<WindowRecord> {
+    // The first windows may have had no joint to infer the dynamics of.
+    let without = learner.windows.len().saturating_sub(learner.inferences.len());
+    let inferences = std::iter::repeat_n(None, without).chain(learner.inferences.iter().map(Some));
+    learner.windows.iter().zip(inferences).map(|(window, inference)| window_record(window, inference)).collect()
+}
+
+fn window_record(window: &WindowObservations, inference: Option<&WindowInference>) -> WindowRecord {
     let touched: BTreeSet<Label> = window.contacts.iter().map(|contact| contact.label).collect();
     let end = |time: Option<&f64>| time.copied().unwrap_or_default();
+    let learned = inference.filter(|inference| inference.failure.is_none());
     WindowRecord {
         t0_s: end(window.times_s.first()),
         t1_s: end(window.times_s.last()),
         labels: touched.into_iter().collect(),
         frames: window.times_s.len(),
-        steps: 0,
+        steps: inference.map_or(0, |inference| inference.steps),
         inference_wall_s: 0.0,
-        elbo: None,
-        log_predictive_density: None,
+        elbo: learned.map(|inference| inference.elbo),
+        log_predictive_density: learned.map(|inference| inference.log_predictive_density),
     }
 }
 
-fn edges(root: Label, labels: &[Label], learner: Option<&Learner>) -> Vec<EdgePosterior> {
+fn edges(root: Label, labels: &[Label], known: Option<Known<'_>>) -> Vec<EdgePosterior> {
     let nodes: Vec<Label> = [root].into_iter().chain(labels.iter().copied().filter(|l| *l != root)).collect();
-    let evidence = |child: Label| learner.and_then(|l| l.evidence.get(&child));
+    let evidence = |child: Label| known.and_then(|known| known.learner.evidence.get(&child));
     let mut log_weights = DMatrix::zeros(nodes.len(), nodes.len());
     for (j, child) in nodes.iter().enumerate().skip(1) {
         let Some(options) = evidence(*child) else { continue };
@@ -104,7 +133,7 @@ fn edges(root: Label, labels: &[Label], learner: Option<&Learner>) -> Vec<EdgePo
                 continue;
             }
             let option = evidence(*child).and_then(|options| option_for(options, *parent, evidence(*parent).is_some()));
-            found.push(edge(*parent, *child, probability, option, learner));
+            found.push(edge(*parent, *child, probability, option, known));
         }
     }
     found.sort_by_key(|e| (e.child, e.parent));
@@ -126,7 +155,7 @@ fn edge(
     child: Label,
     probability: f64,
     option: Option<&ParentEvidence>,
-    learner: Option<&Learner>,
+    known: Option<Known<'_>>,
 ) -> EdgePosterior {
     let mut joint_type = JointTypeProbabilities::UNIFORM;
     if let Some(option) = option {
@@ -134,7 +163,7 @@ fn edge(
         let [rigid, prismatic, revolute] = option.log_evidence.map(|e| (e - total).exp());
         joint_type = JointTypeProbabilities { rigid, prismatic, revolute };
     }
-    let fitted = |joint_type| fitted_axis(option?, learner?, child, joint_type);
+    let fitted = |joint_type| fitted_axis(option?, known?.learner, child, joint_type);
     let revolute = fitted(JointType::Revolute).map(|(axis, covariance)| RevoluteAxis {
         axis_direction: axis.direction.into(),
         axis_point_m: axis.point.into(),
@@ -148,6 +177,11 @@ fn edge(
         let unit = unit[usize::from(joint_type.revolute >= joint_type.prismatic)];
         Quantity::from_log_normal(unit, median.ln(), 1.5, InformedBy::Prior)
     };
+    let likelier = if joint_type.revolute >= joint_type.prismatic { JointType::Revolute } else { JointType::Prismatic };
+    let learned = option.and_then(|option| learned_dynamics(option, known?, child, likelier));
+    let from = |of: fn(&JointDynamics) -> &Quantity, unit, median| {
+        learned.map_or_else(|| prior(unit, median), |d| of(d).clone())
+    };
     EdgePosterior {
         parent,
         child,
@@ -155,12 +189,31 @@ fn edge(
         joint_type,
         revolute,
         prismatic,
-        damping: prior(["N·s/m", "N·m·s/rad"], 2.0),
-        friction: prior(["N", "N·m"], 1.0),
-        joint_inertia: prior(["kg", "kg·m²"], 1.0),
-        lower_limit: None,
-        upper_limit: None,
+        damping: from(|d| &d.damping, ["N·s/m", "N·m·s/rad"], 2.0),
+        friction: from(|d| &d.friction, ["N", "N·m"], 1.0),
+        joint_inertia: from(|d| &d.joint_inertia, ["kg", "kg·m²"], 1.0),
+        lower_limit: learned.and_then(|d| d.lower_limit.clone()),
+        upper_limit: learned.and_then(|d| d.upper_limit.clone()),
     }
+}
+
+/// The dynamics of the joint, if inference was run for this parent and type.
+fn learned_dynamics<'a>(
+    option: &ParentEvidence,
+    known: Known<'a>,
+    child: Label,
+    joint_type: JointType,
+) -> Option<&'a JointDynamics> {
+    index_in_fit(option, known.learner.fit.as_ref()?, child, joint_type)?;
+    known.dynamics?.joints.iter().find(|joint| joint.label == child)
+}
+
+/// Where the joint of this parent and type is in the joint fit.
+fn index_in_fit(option: &ParentEvidence, fit: &KinematicFit, child: Label, joint_type: JointType) -> Option<usize> {
+    fit.joints.iter().position(|joint| {
+        let parent = joint.parent.map(|p| fit.joints[p].child);
+        joint.child == child && joint.joint_type == joint_type && parent == option.parent
+    })
 }
 
 /// The axis by the joint fit where the edge is in it, else by its own.
@@ -173,11 +226,8 @@ fn fitted_axis(
     let own = option.fits[joint_type as usize].as_ref()?;
     let wide = DMatrix::from_diagonal_element(4, 4, 1.0);
     let Some(fit) = &learner.fit else { return Some((own.joint.axis, wide)) };
-    let in_fit = fit.joints.iter().enumerate().find(|(_, joint)| {
-        let parent = joint.parent.map(|p| fit.joints[p].child);
-        joint.child == child && joint.joint_type == joint_type && parent == option.parent
-    });
-    let Some((index, joint)) = in_fit else { return Some((own.joint.axis, wide)) };
+    let Some(index) = index_in_fit(option, fit, child, joint_type) else { return Some((own.joint.axis, wide)) };
+    let joint = &fit.joints[index];
     let (offset, count) = (fit.axis_offset(index), joint.axis_parameters());
     Some((joint.axis, fit.covariance.view((offset, offset), (count, count)).into_owned()))
 }

@@ -218,7 +218,7 @@ impl WindowCutter {
             self.frames.push_back(last.clone());
         }
         self.forget(now - 1.0);
-        WindowJob { frames, contacts, wrenches }
+        WindowJob { frames, contacts, wrenches, zero: self.zero }
     }
 
     /// The tool's contacts, by the part that the tool was nearest to.

@@ -55,6 +55,10 @@ impl Pipeline {
         Some(self.posterior_in_work()?.carried_by(&self.world_from_work()))
     }
 
+    pub(super) fn gravity_in_work(&self) -> Vector3<f64> {
+        self.world_from_work().rotation.transpose() * self.settings.gravity_in_world
+    }
+
     fn world_from_work(&self) -> Pose {
         match self.working_frame {
             WorkingFrame::Open(_) => Pose::identity(),

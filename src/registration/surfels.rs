@@ -19,6 +19,8 @@ const SNAP_COSINE: f64 = 0.94;
 const PLANE_SURFELS: usize = 20;
 /// A part needs this many surfels to be registered.
 const FEWEST_SURFELS: usize = 20;
+/// A flat face is this many surfels of one plane.
+const FACE_SURFELS: usize = 40;
 /// A later surfel this far from those of the first look is a new face \[m\].
 const NEW_FACE_DISTANCE: f64 = 0.015;
 /// Viewing directions are told apart by the nearest of the 12 vertices of an icosahedron.
@@ -274,6 +276,18 @@ impl PartModel {
         let variance = surfels.iter().map(|s| (s.point - centroid).norm_squared()).sum::<f64>() / count;
         let field = NearestField::new(&surfels);
         Self { surfels, centroid, radius: variance.sqrt().max(0.02), field }
+    }
+
+    /// Normals of the large flat faces seen at the first look, up to sign.
+    pub fn face_normals(&self) -> Vec<Vector3<f64>> {
+        let mut faces: Vec<(Vector3<f64>, usize)> = Vec::new();
+        for surfel in self.surfels.iter().filter(|s| !s.grown) {
+            match faces.iter_mut().find(|(normal, _)| normal.dot(&surfel.normal).abs() > 1.0 - 1e-9) {
+                Some((_, count)) => *count += 1,
+                None => faces.push((surfel.normal, 1)),
+            }
+        }
+        faces.into_iter().filter(|(_, count)| *count >= FACE_SURFELS).map(|(normal, _)| normal).collect()
     }
 
     /// Distance from a point at the reference configuration to the nearest surfel \[m\].

@@ -1,0 +1,288 @@
+//! Dynamic parameters of the joints: what each number means, its prior, and the tree made of them.
+//!
+//! Inertial numbers are those that a joint's own motion shows (base parameters, Khalil & Dombre,
+//! "Modeling, Identification and Control of Robots", 2002, chapter 9): a body's inertia about its
+//! own joint, its first moment across the axis, and its mass where an ancestor carries it.
+
+use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
+
+use crate::geometry::HullProperties;
+use crate::inference::{Failure, Gaussian};
+use crate::math::{Pose, Real, Screw, orthonormal_pair};
+use crate::mechanism::effects::{AttachedEffect, EffectKind, Scales};
+use crate::mechanism::{Body, JointParameters, JointType, Limit, Tree};
+use crate::model::{Axis, KinematicJoint};
+
+/// ln damping \[N·s/m or N·m·s/rad\].
+pub const DAMPING: usize = 0;
+/// ln Coulomb friction \[N or N·m\].
+pub const FRICTION: usize = 1;
+/// ln of the body's own inertia on its joint: mass \[kg\], or inertia about the axis \[kg·m²\].
+pub const INERTIA: usize = 2;
+/// Lower end stop \[m or rad\], where there is one.
+pub const LOWER: usize = 3;
+/// Upper end stop \[m or rad\], where there is one.
+pub const UPPER: usize = 4;
+/// ln mass \[kg\] of a body on a hinge.
+pub const MASS: usize = 5;
+/// First of two components of the first moment across the axis \[kg·m\].
+pub const MOMENT: usize = 6;
+/// Numbers of a joint without effects; those of its effects follow.
+pub const SIZE: usize = 8;
+
+/// Density of a hull \[kg/m³\], and how far off it may be (standard deviation of its logarithm):
+/// measured 97 for hollow drawers and 300 for doors (DESIGN.md section 9).
+const DENSITY: f64 = 200.0;
+const LOG_DENSITY_DEVIATION: f64 = 1.2;
+/// Standard deviation of ln(inertia / mass): shapes are better known than densities.
+const LOG_SHAPE_DEVIATION: f64 = 0.35;
+/// Standard deviation of the centre of mass, in spreads of the part's points: a uniform panel's
+/// spread is .29 of its extent, so this is 15 % of the extent.
+const CENTER_DEVIATION: f64 = 0.5;
+/// Standard deviation of ln damping and ln friction about the scales of the first window.
+const LOG_FORCE_DEVIATION: f64 = 1.5;
+/// Standard deviation of an end stop about where the joint was seen to halt \[m or rad\].
+pub const LIMIT_DEVIATION: f64 = 0.01;
+
+/// Typical force and rate of a joint, from the first window in which it moved.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct JointScales {
+    /// \[N or N·m\].
+    pub force: f64,
+    /// \[m/s or rad/s\].
+    pub rate: f64,
+}
+
+/// All that is fixed of one joint and its body.
+#[derive(Clone, Debug)]
+pub struct JointModel {
+    /// Parent, child, type, axis.
+    pub joint: KinematicJoint,
+    /// The child's hull.
+    pub hull: HullProperties,
+    /// Scales of its forces and rates.
+    pub scales: JointScales,
+    /// End stops that it was found to have.
+    pub stops: [bool; 2],
+    /// Whether a moving ancestor carries it.
+    pub carried: bool,
+    /// Whether its first moment shows: on a hinge that gravity loads, or that is carried.
+    pub moment_shows: bool,
+    /// The two directions of the first moment.
+    pub moment_basis: [Vector3<f64>; 2],
+    /// Effects beyond the declared model, whose numbers follow the declared ones.
+    pub effects: Vec<EffectKind>,
+}
+
+impl JointModel {
+    /// How many numbers the joint has.
+    pub fn size(&self) -> usize {
+        SIZE + self.effects.iter().map(|kind| kind.parameters().len()).sum::<usize>()
+    }
+
+    /// The numbers that the equations of motion hold.
+    pub fn active(&self) -> Vec<usize> {
+        let mut active = vec![DAMPING, FRICTION, INERTIA];
+        active.extend([LOWER, UPPER].into_iter().zip(self.stops).filter(|(_, there)| *there).map(|(i, _)| i));
+        if self.carried && self.joint.joint_type == JointType::Revolute {
+            active.push(MASS);
+        }
+        if self.moment_shows {
+            active.extend([MOMENT, MOMENT + 1]);
+        }
+        active.extend(SIZE..self.size());
+        active
+    }
+
+    /// The foot of the hull's centre on the axis (of a hinge), or the centre itself.
+    fn foot(&self, axis: &Axis) -> Vector3<f64> {
+        match self.joint.joint_type {
+            JointType::Revolute => axis.point + axis.direction * axis.direction.dot(&(self.hull.center - axis.point)),
+            _ => self.hull.center,
+        }
+    }
+
+    /// Second moment of the hull per volume \[m²\].
+    fn shape(&self) -> Matrix3<f64> {
+        self.hull.inertia_per_density / self.hull.volume
+    }
+
+    /// Inertia on the joint per mass, of the hull (1 or m²).
+    fn inertia_per_mass(&self) -> f64 {
+        let n = self.joint.axis.direction;
+        match self.joint.joint_type {
+            JointType::Revolute => {
+                let arm = self.hull.center - self.foot(&self.joint.axis);
+                n.dot(&(self.shape() * n)) + arm.norm_squared()
+            }
+            _ => 1.0,
+        }
+    }
+
+    /// The prior of the joint's numbers.
+    pub fn prior(&self, seen: [f64; 2]) -> Result<Gaussian, Failure> {
+        let mut mean = DVector::zeros(self.size());
+        // x = mean + map · z with z standard normal.
+        let mut map = DMatrix::identity(self.size(), self.size());
+        mean[DAMPING] = (0.3 * self.scales.force / self.scales.rate).ln();
+        mean[FRICTION] = (0.3 * self.scales.force).ln();
+        map[(DAMPING, DAMPING)] = LOG_FORCE_DEVIATION;
+        map[(FRICTION, FRICTION)] = LOG_FORCE_DEVIATION;
+        let mass = DENSITY * self.hull.volume;
+        mean[MASS] = mass.ln();
+        map[(MASS, MASS)] = LOG_DENSITY_DEVIATION;
+        mean[INERTIA] = (mass * self.inertia_per_mass()).ln();
+        map[(INERTIA, MASS)] = LOG_DENSITY_DEVIATION;
+        map[(INERTIA, INERTIA)] = LOG_SHAPE_DEVIATION;
+        for (i, (place, position)) in [LOWER, UPPER].into_iter().zip(seen).enumerate() {
+            mean[place] = position;
+            map[(place, place)] = if self.stops[i] { LIMIT_DEVIATION } else { 1.0 };
+        }
+        let offset = self.hull.center - self.foot(&self.joint.axis);
+        for (i, basis) in self.moment_basis.iter().enumerate() {
+            let moment = mass * offset.dot(basis);
+            let spread = self.hull.spread.dot(&basis.abs()).max(0.01);
+            mean[MOMENT + i] = moment;
+            map[(MOMENT + i, MOMENT + i)] = (0.36 * moment * moment + (mass * CENTER_DEVIATION * spread).powi(2)).sqrt();
+            map[(MOMENT + i, MASS)] = 0.8 * moment;
+        }
+        Gaussian::from_moments(&mean, &(&map * map.transpose()))
+    }
+
+    /// The body's inertial properties at the reference configuration from the joint's numbers.
+    fn inertia<T: Real>(&self, x: &[T], axis: &Axis) -> (T, Vector3<T>, Matrix3<T>) {
+        let shape = self.shape();
+        let moment = self.moment_basis[0].map(T::constant) * x[MOMENT] + self.moment_basis[1].map(T::constant) * x[MOMENT + 1];
+        match self.joint.joint_type {
+            JointType::Revolute => {
+                let mass = x[MASS].exp();
+                let n = axis.direction;
+                let com = self.foot(axis).map(T::constant) + moment / mass;
+                let along = T::constant(n.dot(&(shape * n)));
+                let about_axis = x[INERTIA].exp() - moment.norm_squared() / mass - mass * along;
+                let about_com = shape.map(T::constant) * mass + (n * n.transpose()).map(T::constant) * about_axis;
+                (mass, com, about_com)
+            }
+            _ => {
+                let mass = x[INERTIA].exp();
+                (mass, self.hull.center.map(T::constant) + moment / mass, shape.map(T::constant) * mass)
+            }
+        }
+    }
+
+    fn parameters<T: Real>(&self, x: &[T]) -> JointParameters<T> {
+        let mut parameters = JointParameters::new(x[DAMPING].exp(), x[FRICTION].exp());
+        parameters.lower = self.stops[0].then(|| Limit::at(x[LOWER]));
+        parameters.upper = self.stops[1].then(|| Limit::at(x[UPPER]));
+        let scales = Scales {
+            force: self.scales.force,
+            rate: self.scales.rate,
+            position: 0.3,
+            duration_s: 4.0,
+        };
+        let mut at = SIZE;
+        for kind in &self.effects {
+            let values: Vec<T> = kind.parameters().iter().enumerate().map(|(i, p)| p.physical(x[at + i], &scales)).collect();
+            at += values.len();
+            parameters.effects.push(AttachedEffect::new(*kind, &values));
+        }
+        parameters
+    }
+}
+
+/// The joints with their numbers one joint after the other.
+#[derive(Clone, Debug)]
+pub struct Mechanism {
+    /// Parents first.
+    pub joints: Vec<JointModel>,
+    /// \[m/s²\].
+    pub gravity: Vector3<f64>,
+}
+
+impl Mechanism {
+    /// First number of a joint.
+    pub fn offset(&self, joint: usize) -> usize {
+        self.joints[..joint].iter().map(JointModel::size).sum()
+    }
+
+    /// The tree of one body per joint, at the configuration where the `frozen` joints are at their
+    /// positions, and fixed, and the others at zero.
+    pub fn tree<T: Real>(&self, x: &[T], axes: &[Axis], frozen: &[Option<f64>]) -> Result<Tree<T>, Failure> {
+        let mut carried: Vec<Pose> = Vec::with_capacity(self.joints.len());
+        let mut bodies: Vec<Body<T>> = Vec::with_capacity(self.joints.len());
+        let mut at = 0;
+        for (k, model) in self.joints.iter().enumerate() {
+            let own = &x[at..at + model.size()];
+            at += model.size();
+            let parent = model.joint.parent.map_or_else(Pose::identity, |p| carried[p]);
+            let screw = KinematicJoint { axis: axes[k], ..model.joint }.screw();
+            let (mass, com, about_com) = model.inertia(own, &axes[k]);
+            let here = frozen[k].map_or(parent, |q| parent * screw.displacement(q));
+            let pose = Pose::constant(&here);
+            let body = Body {
+                parent: model.joint.parent,
+                joint: if frozen[k].is_some() { JointType::Rigid } else { model.joint.joint_type },
+                screw: Screw(parent.adjoint(&screw.0).map(T::constant)),
+                mass,
+                com_in_world: pose.transform_point(&com),
+                inertia_about_com: pose.rotation * about_com * pose.rotation.transpose(),
+                parameters: if frozen[k].is_some() { JointParameters::default() } else { model.parameters(own) },
+            };
+            bodies.push(body);
+            carried.push(here);
+        }
+        Tree::new(bodies, self.gravity).map_err(|_| Failure::Singular)
+    }
+
+    /// The centre of mass of a joint's child at the reference configuration \[m\].
+    pub fn center_of_mass(&self, joint: usize, x: &[f64]) -> Vector3<f64> {
+        let model = &self.joints[joint];
+        model.inertia(&x[self.offset(joint)..], &model.joint.axis).1
+    }
+}
+
+/// The joint models of a kinematic fit; `scales` and `stops` by joint.
+pub fn joint_models(
+    joints: &[KinematicJoint],
+    hull: impl Fn(&KinematicJoint) -> HullProperties,
+    scales: &[JointScales],
+    stops: &[[bool; 2]],
+    gravity: &Vector3<f64>,
+) -> Vec<JointModel> {
+    let hinge_above = |k: usize| {
+        let mut above = joints[k].parent;
+        while let Some(p) = above {
+            if joints[p].joint_type == JointType::Revolute {
+                return Some(joints[p].axis.direction);
+            }
+            above = joints[p].parent;
+        }
+        None
+    };
+    joints
+        .iter()
+        .enumerate()
+        .map(|(k, joint)| {
+            let carried = joint.parent.is_some();
+            let revolute = joint.joint_type == JointType::Revolute;
+            // A hinge within .5° of gravity is loaded by less than a hundredth of the weight.
+            let loaded = revolute && joint.axis.direction.cross(gravity).norm() > 0.01 * gravity.norm();
+            let (moment_shows, across) = if revolute {
+                (loaded || carried, joint.axis.direction)
+            } else {
+                (hinge_above(k).is_some(), hinge_above(k).unwrap_or(joint.axis.direction))
+            };
+            let (first, second) = orthonormal_pair(&across);
+            JointModel {
+                joint: *joint,
+                hull: hull(joint),
+                scales: scales[k],
+                stops: stops[k],
+                carried,
+                moment_shows,
+                moment_basis: [first, second],
+                effects: Vec::new(),
+            }
+        })
+        .collect()
+}

@@ -1,0 +1,145 @@
+//! The posterior of the dynamics, as it is published.
+
+use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
+
+use super::layout::{DAMPING, FRICTION, INERTIA, LOWER, MASS, MOMENT, UPPER};
+use super::learner::{Block, DynamicsLearner};
+use crate::inference::Failure;
+use crate::mechanism::JointType;
+use crate::types::Label;
+use crate::types::posterior::{InformedBy, Quantity};
+
+/// Of one joint.
+#[derive(Clone, Debug, PartialEq)]
+pub struct JointDynamics {
+    /// The joint's child.
+    pub label: Label,
+    /// d.
+    pub damping: Quantity,
+    /// F.
+    pub friction: Quantity,
+    /// M_jj at q = 0.
+    pub joint_inertia: Quantity,
+    /// End stops, where there are any known.
+    pub lower_limit: Option<Quantity>,
+    /// The upper one.
+    pub upper_limit: Option<Quantity>,
+}
+
+/// Of one part.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PartDynamics {
+    /// The part.
+    pub label: Label,
+    /// Its mass.
+    pub mass: Quantity,
+    /// Its centre of mass at the reference configuration \[m\].
+    pub com_in_world: Vector3<f64>,
+    /// Covariance of it \[m²\].
+    pub com_covariance: Matrix3<f64>,
+}
+
+/// All of it, with the joint distribution that it is made of.
+#[derive(Clone, Debug)]
+pub struct DynamicsPosterior {
+    /// By joint, parents first.
+    pub joints: Vec<JointDynamics>,
+    /// Of every joint's child.
+    pub parts: Vec<PartDynamics>,
+    /// Mean of all joints' numbers ([`super::layout`]), one joint after the other.
+    pub mean: DVector<f64>,
+    /// Their covariance.
+    pub covariance: DMatrix<f64>,
+}
+
+impl DynamicsLearner {
+    /// What is known of the joints of the last kinematic fit.
+    pub fn posterior(&self) -> Result<DynamicsPosterior, Failure> {
+        let models = &self.mechanism.joints;
+        if models.is_empty() {
+            return Err(Failure::NoInformation);
+        }
+        let blocks: Vec<Block> = models.iter().map(|m| Block::Dynamics(m.joint.child)).collect();
+        let (mean, covariance) = self.belief.product(None).moments(&blocks)?;
+        let mut posterior = DynamicsPosterior { joints: Vec::new(), parts: Vec::new(), mean, covariance };
+        let prior_deviation = |k: usize, entry: usize| {
+            let prior = self.belief.prior(&blocks[k])?.gaussian.moments().ok()?;
+            Some(prior.1[(entry, entry)].sqrt())
+        };
+        for (k, model) in models.iter().enumerate() {
+            let at = self.mechanism.offset(k);
+            let deviation = |entry: usize| posterior.covariance[(at + entry, at + entry)].max(0.0).sqrt();
+            let informed = |entry: usize, deviation: f64| match prior_deviation(k, entry) {
+                Some(prior) if deviation < 0.7 * prior => InformedBy::Dynamics,
+                _ => InformedBy::Prior,
+            };
+            let revolute = model.joint.joint_type == JointType::Revolute;
+            let units = if revolute { ["N·m·s/rad", "N·m", "kg·m²", "rad"] } else { ["N·s/m", "N", "kg", "m"] };
+            let log_normal = |unit: &str, entry: usize| {
+                Quantity::from_log_normal(unit, posterior.mean[at + entry], deviation(entry), informed(entry, deviation(entry)))
+            };
+            let stop = |side: usize, entry: usize| {
+                model.stops[side].then(|| {
+                    Quantity::from_normal(units[3], posterior.mean[at + entry], deviation(entry), InformedBy::Dynamics)
+                })
+            };
+            let (inertia, inertia_deviation) = self.joint_inertia(k, &posterior.mean, &posterior.covariance)?;
+            posterior.joints.push(JointDynamics {
+                label: model.joint.child,
+                damping: log_normal(units[0], DAMPING),
+                friction: log_normal(units[1], FRICTION),
+                joint_inertia: Quantity::from_log_normal(
+                    units[2],
+                    inertia,
+                    inertia_deviation,
+                    informed(INERTIA, inertia_deviation),
+                ),
+                lower_limit: stop(0, LOWER),
+                upper_limit: stop(1, UPPER),
+            });
+            let com = |x: &DVector<f64>| self.mechanism.center_of_mass(k, x.as_slice());
+            let center = com(&posterior.mean);
+            let mut com_covariance = Matrix3::zeros();
+            let entries = [MASS, INERTIA, MOMENT, MOMENT + 1];
+            let slopes = entries.map(|entry| {
+                let mut moved = posterior.mean.clone();
+                moved[at + entry] += 1e-5;
+                (com(&moved) - center) * 1e5
+            });
+            for (a, i) in slopes.iter().zip(entries) {
+                for (b, j) in slopes.iter().zip(entries) {
+                    com_covariance += a * b.transpose() * posterior.covariance[(at + i, at + j)];
+                }
+            }
+            // Along the axis nothing is learned; the hull says within a spread.
+            com_covariance += Matrix3::from_diagonal(&model.hull.spread.map(|s| (0.3 * s).powi(2)));
+            posterior.parts.push(PartDynamics {
+                label: model.joint.child,
+                mass: log_normal("kg", if revolute { MASS } else { INERTIA }),
+                com_in_world: center,
+                com_covariance,
+            });
+        }
+        Ok(posterior)
+    }
+
+    /// ln M_jj at q = 0 and its standard deviation.
+    fn joint_inertia(&self, joint: usize, mean: &DVector<f64>, covariance: &DMatrix<f64>) -> Result<(f64, f64), Failure> {
+        let axes: Vec<_> = self.mechanism.joints.iter().map(|m| m.joint.axis).collect();
+        let value = |x: &DVector<f64>| {
+            let tree = self.mechanism.tree(x.as_slice(), &axes, &vec![None; axes.len()])?;
+            let inertia = tree.joint_inertia(joint);
+            if inertia > 0.0 { Ok(inertia.ln()) } else { Err(Failure::Diverged) }
+        };
+        let here = value(mean)?;
+        let slope = DVector::from_iterator(
+            mean.len(),
+            (0..mean.len()).map(|i| {
+                let mut moved = mean.clone();
+                moved[i] += 1e-5;
+                value(&moved).map_or(0.0, |v| (v - here) * 1e5)
+            }),
+        );
+        Ok((here, slope.dot(&(covariance * &slope)).max(0.0).sqrt()))
+    }
+}

@@ -1,0 +1,310 @@
+//! Fits one window against a cavity and makes its site.
+//!
+//! The site says what the window says of the dynamic numbers θ at the kinematics η it was learned
+//! with, and how that would change if η (axes, tool offset) were off: a factor of θ + S (η − η̂)
+//! with S = H⁻¹ Jᵀ J_η (consider parameters; Schmidt 1966). It has no information about η itself,
+//! which the kinematic fit took from the same data; errors of η that windows share stay shared.
+
+use nalgebra::{DMatrix, DVector};
+
+use super::innovations::{Gain, Innovations, WindowModel, normal_equations};
+use super::layout::{FRICTION, Mechanism};
+use super::track::{JointTrack, TrackKinematics, TrackSource, joint_track};
+use crate::inference::{Failure, Gaussian, LeastSquares, Linearization, Solution, SolverSettings, solve};
+use crate::math::orthonormal_pair;
+use crate::model::{Axis, KinematicJoint};
+
+/// Process noise is at most this many times what the wrench sensor explains.
+const NOISE_SCALES: [f64; 6] = [1.0, 3.0, 10.0, 30.0, 100.0, 300.0];
+/// Standard deviation of ln κ: the model is expected to be right within a factor of a few.
+const LOG_NOISE_DEVIATION: f64 = 1.5;
+/// Weight, in innovations, of the prior that innovations have unit variance.
+const VARIANCE_PRIOR: f64 = 10.0;
+/// A stuck joint's load is known to this share: friction below the load is unlikelier than that.
+const LOAD_DEVIATION: f64 = 0.1;
+
+/// One window, ready to be fitted.
+pub struct WindowFit<'a> {
+    /// Joints and gravity.
+    pub mechanism: &'a Mechanism,
+    /// The kinematic fit's view.
+    pub source: TrackSource<'a>,
+    /// Axes and offset of the kinematic fit.
+    pub kinematics: TrackKinematics,
+    /// Positions of the joints that rest.
+    pub frozen: Vec<Option<f64>>,
+    /// The window in joint space.
+    pub track: JointTrack,
+    /// Entries of the full parameter vector that the window depends on.
+    pub active: Vec<usize>,
+    /// The full parameter vector to start from.
+    pub base: Vec<f64>,
+}
+
+/// A fitted window.
+#[derive(Clone, Debug)]
+pub struct FittedWindow {
+    /// The optimum of the active entries.
+    pub solution: Solution,
+    /// κ.
+    pub noise_scale: f64,
+    /// Innovations at the optimum.
+    pub innovations: Innovations,
+    /// Log density of the window's observations by the cavity (Laplace), up to a constant of the
+    /// observations.
+    pub log_predictive: f64,
+    /// Factor by which the information is reduced for innovations that are larger than their
+    /// covariance, or not white.
+    pub reduction: f64,
+    /// Linearizations spent.
+    pub steps: usize,
+}
+
+struct Problem<'a> {
+    model: WindowModel<'a>,
+    active: &'a [usize],
+    x: Vec<f64>,
+    gains: Vec<Gain>,
+    latest: Innovations,
+}
+
+impl Problem<'_> {
+    fn set(&mut self, x: &DVector<f64>) {
+        for (&at, value) in self.active.iter().zip(x.iter()) {
+            self.x[at] = *value;
+        }
+    }
+}
+
+impl LeastSquares for Problem<'_> {
+    fn linearize(&mut self, x: &DVector<f64>) -> Result<Linearization, Failure> {
+        self.set(x);
+        let innovations = self.model.linearize(&self.x, self.active)?;
+        let (curvature, gradient) = normal_equations(&innovations, self.active.len());
+        let cost = innovations.cost();
+        self.gains = innovations.gains.clone();
+        self.latest = innovations;
+        Ok(Linearization { cost, gradient, curvature })
+    }
+
+    fn cost(&mut self, x: &DVector<f64>) -> Result<f64, Failure> {
+        self.set(x);
+        let residuals = self.model.residuals(&self.x, &self.gains)?;
+        Ok(0.5 * residuals.iter().map(|e| e * e).sum::<f64>())
+    }
+}
+
+impl WindowFit<'_> {
+    fn model(&self, noise_scale: f64) -> WindowModel<'_> {
+        WindowModel {
+            mechanism: self.mechanism,
+            axes: &self.kinematics.axes,
+            frozen: &self.frozen,
+            moving: self.source.moving,
+            track: &self.track,
+            noise_scale,
+        }
+    }
+
+    /// Fits the window from the best of `starts`. κ is chosen anew unless it is given.
+    pub fn fit(&self, prior: &Gaussian, starts: &[DVector<f64>], noise_scale: Option<f64>, steps: usize) -> Result<FittedWindow, Failure> {
+        let mut spent = 0;
+        let mut best: Option<(f64, DVector<f64>)> = None;
+        let first_scale = noise_scale.unwrap_or(NOISE_SCALES[1]);
+        for start in starts {
+            if starts.len() == 1 {
+                best = Some((0.0, start.clone()));
+                break;
+            }
+            let mut problem = self.problem(first_scale);
+            let settings = SolverSettings { steps: (steps / 3).max(3), ..SolverSettings::default() };
+            let Ok(solution) = solve(&mut problem, prior, start, &settings) else { continue };
+            spent += solution.steps;
+            let evidence = solution.log_evidence - problem.latest.half_log_determinant;
+            if best.as_ref().is_none_or(|(other, _)| evidence > *other) {
+                best = Some((evidence, solution.point));
+            }
+        }
+        let (_, mut point) = best.ok_or(Failure::Diverged)?;
+        let mut scale = first_scale;
+        let rounds = if noise_scale.is_some() { 1 } else { 2 };
+        for round in 0..rounds {
+            let mut problem = self.problem(scale);
+            let settings = SolverSettings { steps, ..SolverSettings::default() };
+            let solution = solve(&mut problem, prior, &point, &settings)?;
+            spent += solution.steps;
+            if round + 1 < rounds {
+                let (best, tried) = self.best_noise_scale(&solution.point, scale)?;
+                spent += tried;
+                if best != scale {
+                    scale = best;
+                    point = solution.point;
+                    continue;
+                }
+            }
+            let innovations = problem.latest;
+            return Ok(FittedWindow {
+                reduction: reduction(&innovations.whitened, self.source.moving.len()),
+                noise_scale: scale,
+                log_predictive: solution.log_evidence - innovations.half_log_determinant - scale_cost(scale),
+                innovations,
+                solution,
+                steps: spent,
+            });
+        }
+        Err(Failure::Diverged)
+    }
+
+    /// κ of the greatest likelihood at given parameters, by ascent over the grid; how many
+    /// linearizations that took.
+    fn best_noise_scale(&self, point: &DVector<f64>, from: f64) -> Result<(f64, usize), Failure> {
+        let mut x = self.base.clone();
+        for (&at, value) in self.active.iter().zip(point.iter()) {
+            x[at] = *value;
+        }
+        let mut tried = 0;
+        let mut density = |scale: f64| {
+            tried += 1;
+            let innovations = self.model(scale).linearize(&x, &[])?;
+            Ok::<_, Failure>(-innovations.cost() - innovations.half_log_determinant - scale_cost(scale))
+        };
+        let mut at = NOISE_SCALES.iter().position(|s| *s >= from).unwrap_or(0);
+        let mut best = density(NOISE_SCALES[at])?;
+        for direction in [1, -1_isize] {
+            while let Some(next) = at.checked_add_signed(direction).filter(|i| *i < NOISE_SCALES.len()) {
+                let trial = density(NOISE_SCALES[next])?;
+                if trial <= best {
+                    break;
+                }
+                best = trial;
+                at = next;
+            }
+        }
+        Ok((NOISE_SCALES[at], tried / 3))
+    }
+
+    fn problem(&self, scale: f64) -> Problem<'_> {
+        Problem {
+            model: self.model(scale),
+            active: &self.active,
+            x: self.base.clone(),
+            gains: Vec::new(),
+            latest: Innovations::default(),
+        }
+    }
+
+    /// S: by how much the optimum would move per unit of each kinematic number; columns in the order
+    /// of [`kinematic_directions`], in units of `deviations`.
+    pub fn sensitivity(&self, fitted: &FittedWindow, deviations: &[f64]) -> DMatrix<f64> {
+        let p = self.active.len();
+        let mut x = self.base.clone();
+        for (&at, value) in self.active.iter().zip(fitted.solution.point.iter()) {
+            x[at] = *value;
+        }
+        let jacobian = DMatrix::from_row_slice(fitted.innovations.whitened.len(), p, &fitted.innovations.slopes);
+        let mut hessian = jacobian.transpose() * &jacobian;
+        let ridge = 1e-9 * hessian.diagonal().max() + 1e-12;
+        for i in 0..p {
+            hessian[(i, i)] += ridge;
+        }
+        let cholesky = hessian.cholesky();
+        let columns = deviations.len();
+        let mut result = DMatrix::zeros(p, columns);
+        let Some(cholesky) = cholesky else { return result };
+        for (column, deviation) in deviations.iter().enumerate().filter(|(_, d)| **d > 0.0) {
+            let step = 0.5 * deviation;
+            let kinematics = self.moved(column, step);
+            let Some(track) = joint_track(&self.source, &kinematics) else { continue };
+            let model = WindowModel { axes: &kinematics.axes, track: &track, ..self.model(fitted.noise_scale) };
+            let Ok(residuals) = model.residuals(&x, &fitted.innovations.gains) else { continue };
+            if residuals.len() != fitted.innovations.whitened.len() {
+                continue;
+            }
+            let slope = DVector::from_iterator(
+                residuals.len(),
+                residuals.iter().zip(&fitted.innovations.whitened).map(|(a, b)| (a - b) / step),
+            );
+            result.set_column(column, &cholesky.solve(&(jacobian.transpose() * slope)));
+        }
+        result
+    }
+
+    /// The kinematics with one number moved: axis parameters joint by joint, then the tool's offset.
+    fn moved(&self, column: usize, step: f64) -> TrackKinematics {
+        let mut moved = self.kinematics.clone();
+        let mut at = column;
+        for (k, joint) in self.source.joints.iter().enumerate() {
+            let count = joint.axis_parameters();
+            if at < count {
+                moved.axes[k] = retracted(&KinematicJoint { axis: moved.axes[k], ..*joint }, at, step);
+                return moved;
+            }
+            at -= count;
+        }
+        moved.tool_offset[at] += step;
+        moved
+    }
+}
+
+/// An axis moved along one of its four directions; see the kinematic fit.
+fn retracted(joint: &KinematicJoint, which: usize, step: f64) -> Axis {
+    let Axis { direction, point } = joint.axis;
+    let (first, second) = orthonormal_pair(&direction);
+    let along = if which.is_multiple_of(2) { first } else { second };
+    if which < 2 {
+        Axis { direction: (direction + (along * step).cross(&direction)).normalize(), point }
+    } else {
+        Axis { direction, point: point + along * step }
+    }
+}
+
+fn scale_cost(scale: f64) -> f64 {
+    0.5 * (scale.ln() / LOG_NOISE_DEVIATION).powi(2)
+}
+
+/// Variance of the innovations, at least one, times their integrated autocorrelation, at least one.
+fn reduction(whitened: &[f64], rows: usize) -> f64 {
+    let n = whitened.len() as f64;
+    let squares: f64 = whitened.iter().map(|e| e * e).sum();
+    let variance = ((squares + VARIANCE_PRIOR) / (n + VARIANCE_PRIOR)).max(1.0);
+    let correlation: f64 = (1..=6)
+        .map(|lag| whitened.iter().zip(whitened.iter().skip(lag * rows)).map(|(a, b)| a * b).sum::<f64>() / squares.max(1e-12))
+        .sum();
+    variance * (1.0 + 2.0 * correlation).clamp(1.0, 20.0)
+}
+
+/// Entries of one joint's numbers among `active`, that only inertia needs.
+pub fn inertial_entries(active: &[usize]) -> Vec<usize> {
+    use super::layout::{INERTIA, MASS, MOMENT};
+    active.iter().copied().filter(|i| [INERTIA, MASS, MOMENT, MOMENT + 1].contains(i)).collect()
+}
+
+/// −ln P(F > load) with the load known to [`LOAD_DEVIATION`], logistic for the normal of that slope.
+fn load_cost(log_friction: f64, log_load: f64) -> f64 {
+    let z = 1.702 * (log_load - log_friction) / LOAD_DEVIATION;
+    if z > 30.0 { z } else { z.exp().ln_1p() }
+}
+
+/// What it says of ln F ~ N(mean, deviation²) that friction held a load: the Gaussian factor of
+/// matching moments, of a block of `size` numbers.
+pub fn load_factor(log_load: f64, mean: f64, deviation: f64, size: usize) -> Gaussian {
+    let (mut total, mut first, mut second) = (0.0, 0.0, 0.0);
+    for i in 0..=400 {
+        let x = mean + deviation * 5.0 * (f64::from(i) / 200.0 - 1.0);
+        let weight = (-0.5 * ((x - mean) / deviation).powi(2) - load_cost(x, log_load)).exp();
+        total += weight;
+        first += weight * x;
+        second += weight * x * x;
+    }
+    let mut gaussian = Gaussian::flat(size);
+    if total > 1e-12 {
+        let matched = first / total;
+        let variance = (second / total - matched * matched).max(1e-6);
+        let precision = 1.0 / variance - 1.0 / (deviation * deviation);
+        if precision > 0.0 {
+            gaussian.precision[(FRICTION, FRICTION)] = precision;
+            gaussian.information[FRICTION] = matched / variance - mean / (deviation * deviation);
+        }
+    }
+    gaussian
+}

@@ -1,0 +1,381 @@
+//! What a window measured of its joints' positions, in joint space, and the wrench that acted.
+//!
+//! Tool positions x in bins of 40 ms and part poses are linearized about the joint positions that
+//! explain them best: each observation is H q with unit noise. Given the axes and the tool's offset
+//! o, the contact point p follows from the track itself: the track's circle gives the lever, so that
+//! errors of axis and o cancel in it as they should.
+
+use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
+
+use crate::math::Pose;
+use crate::mechanism::WrenchSample;
+use crate::model::{Axis, Contact, KinematicJoint, WindowObservations};
+use crate::types::{Label, Stamp};
+
+/// Span of tool positions that make one observation \[s\].
+const BIN_S: f64 = 0.04;
+/// Registration error that frames at one pose share \[m\], and how near that is \[m\]; see
+/// [`crate::model::KinematicSettings`].
+const SHARED_ERROR: f64 = 0.0015;
+const SHARED_DISTANCE: f64 = 0.010;
+/// Degrees of freedom of the weights on part poses.
+const STUDENT_FREEDOM: f64 = 6.0;
+/// The wrench acts this long before and after the contact's frames \[s\]: half a frame.
+const CONTACT_MARGIN_S: f64 = 0.1;
+/// Least standard deviation of one tool position \[m\].
+const LEAST_TOOL_DEVIATION: f64 = 1e-4;
+
+/// What of the kinematic fit a window's track depends on.
+#[derive(Clone, Debug)]
+pub struct TrackKinematics {
+    /// Axes by joint.
+    pub axes: Vec<Axis>,
+    /// o \[m\].
+    pub tool_offset: Vector3<f64>,
+}
+
+/// One window as the kinematic fit sees it.
+pub struct TrackSource<'a> {
+    /// Joints, parents first.
+    pub joints: &'a [KinematicJoint],
+    /// Joint positions by joint and frame.
+    pub positions: &'a [Vec<f64>],
+    /// Measurements.
+    pub window: &'a WindowObservations,
+    /// Contacts, the tool's position used or not.
+    pub contacts: &'a [Contact],
+    /// Contact points by contact, if fitted.
+    pub contact_points: &'a [Vector3<f64>],
+    /// Whether the tool's position is an observation.
+    pub use_tool: bool,
+    /// Time zero.
+    pub zero: Stamp,
+    /// Joints that move in the window, by index.
+    pub moving: &'a [usize],
+}
+
+/// H q with unit noise.
+#[derive(Clone, Debug)]
+pub struct Observation {
+    /// \[s\] since time zero.
+    pub time_s: f64,
+    /// One column per moving joint.
+    pub rows: DMatrix<f64>,
+    /// H q as measured.
+    pub value: DVector<f64>,
+}
+
+/// A window in joint space.
+#[derive(Clone, Debug)]
+pub struct JointTrack {
+    /// In order of time.
+    pub observations: Vec<Observation>,
+    /// Smoothed positions of the moving joints at the observations.
+    pub positions: Vec<DVector<f64>>,
+    /// The wrench on the contact's part at the true contact x − o; zero without contact.
+    pub samples: Vec<WrenchSample>,
+    /// The joint whose child is touched.
+    pub touched: Option<usize>,
+    /// Standard deviation of one force reading \[N\].
+    pub force_deviation: f64,
+    /// Span between two force readings \[s\].
+    pub sample_span_s: f64,
+}
+
+impl TrackSource<'_> {
+    fn displacements(&self, axes: &[Axis], q: &[f64]) -> Vec<Pose> {
+        let mut all: Vec<Pose> = Vec::with_capacity(self.joints.len());
+        for (k, joint) in self.joints.iter().enumerate() {
+            let parent = joint.parent.map_or_else(Pose::identity, |p| all[p]);
+            all.push(parent * KinematicJoint { axis: axes[k], ..*joint }.screw().displacement(q[k]));
+        }
+        all
+    }
+
+    /// Twist of joint `of`'s child per rate of each moving joint (zero if it is no ancestor).
+    fn twists(&self, axes: &[Axis], displacements: &[Pose], of: usize) -> Vec<Vector6<f64>> {
+        let mut twists = vec![Vector6::zeros(); self.moving.len()];
+        let mut at = Some(of);
+        while let Some(k) = at {
+            let joint = &self.joints[k];
+            if let Some(column) = self.moving.iter().position(|&m| m == k) {
+                let parent = joint.parent.map_or_else(Pose::identity, |p| displacements[p]);
+                twists[column] = parent.adjoint(&KinematicJoint { axis: axes[k], ..*joint }.screw().0);
+            }
+            at = joint.parent;
+        }
+        twists
+    }
+
+    /// Positions of all joints at a time, between the frames.
+    fn positions_at(&self, time_s: f64) -> Vec<f64> {
+        let times = &self.window.times_s;
+        let after = times.partition_point(|&t| t < time_s).clamp(1, times.len() - 1);
+        let (t0, t1) = (times[after - 1], times[after]);
+        let weight = ((time_s - t0) / (t1 - t0)).clamp(0.0, 1.0);
+        self.positions.iter().map(|p| p[after - 1] + weight * (p[after] - p[after - 1])).collect()
+    }
+
+    fn contact(&self) -> Option<(usize, &Contact, Option<Vector3<f64>>)> {
+        let (index, contact) = self.contacts.iter().enumerate().find(|(_, c)| !c.track.is_empty())?;
+        let joint = self.joints.iter().position(|j| j.child == contact.label)?;
+        Some((joint, contact, self.contact_points.get(index).copied()))
+    }
+
+    fn contact_span(&self, contact: &Contact) -> Option<(f64, f64)> {
+        let time = |t: Option<&(usize, Vector3<f64>, f64)>| t.and_then(|(k, _, _)| self.window.times_s.get(*k)).copied();
+        Some((time(contact.track.first())?, time(contact.track.last())?))
+    }
+}
+
+/// The window in joint space, given the axes and the tool's offset. `None` with fewer than two
+/// frames.
+pub fn joint_track(source: &TrackSource<'_>, kinematics: &TrackKinematics) -> Option<JointTrack> {
+    let times = &source.window.times_s;
+    if times.len() < 2 {
+        return None;
+    }
+    let (begin_s, end_s) = (times[0], times[times.len() - 1]);
+    let seconds = |w: &crate::types::AppliedWrench| w.stamp.seconds_since(source.zero);
+    let readings: Vec<_> = source.window.wrenches.iter().filter(|w| (begin_s - 0.1..=end_s + 0.1).contains(&seconds(w))).collect();
+    let touching = source.contact().and_then(|(joint, contact, point)| Some((joint, source.contact_span(contact)?, point)));
+    let samples: Vec<WrenchSample> = touching.map_or_else(Vec::new, |(_, (from_s, to_s), _)| {
+        readings
+            .iter()
+            .filter(|w| (from_s - CONTACT_MARGIN_S..=to_s + CONTACT_MARGIN_S).contains(&seconds(w)))
+            .map(|w| WrenchSample {
+                stamp_s: seconds(w),
+                point_in_world: w.point_in_world - kinematics.tool_offset,
+                force_in_world: w.force_in_world,
+                torque_in_world: w.torque_in_world,
+            })
+            .collect()
+    });
+    let mut located: Vec<(f64, Located)> = frame_information(source, kinematics);
+    if let Some((joint, span, point)) = touching.filter(|_| source.use_tool) {
+        let tool: Vec<(f64, Vector3<f64>)> =
+            readings.iter().map(|w| (seconds(w), w.point_in_world)).filter(|(t, _)| *t >= span.0 && *t <= span.1).collect();
+        located.extend(tool_information(source, kinematics, joint, point, &tool));
+    }
+    located.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let mut observations: Vec<Observation> = Vec::with_capacity(located.len());
+    let mut positions = Vec::with_capacity(located.len());
+    for (time_s, located) in located {
+        if let Some((rows, value)) = located.whitened() {
+            observations.push(Observation { time_s, rows, value });
+            positions.push(located.position);
+        }
+    }
+    let forces: Vec<(f64, Vector3<f64>)> = samples.iter().map(|s| (s.stamp_s, s.force_in_world)).collect();
+    let span_s = samples.last().map_or(0.0, |l| l.stamp_s - samples[0].stamp_s);
+    Some(JointTrack {
+        observations,
+        positions,
+        touched: touching.map(|(joint, _, _)| joint),
+        force_deviation: local_deviation(&forces),
+        sample_span_s: span_s / (samples.len().max(2) - 1) as f64,
+        samples: with_ends(samples),
+    })
+}
+
+/// Lets the force be zero outside of the contact.
+fn with_ends(mut samples: Vec<WrenchSample>) -> Vec<WrenchSample> {
+    let at_rest = |sample: &WrenchSample, shift_s: f64| WrenchSample {
+        stamp_s: sample.stamp_s + shift_s,
+        force_in_world: Vector3::zeros(),
+        torque_in_world: Vector3::zeros(),
+        ..*sample
+    };
+    if let (Some(first), Some(last)) = (samples.first().copied(), samples.last().copied()) {
+        samples.insert(0, at_rest(&first, -0.008));
+        samples.push(at_rest(&last, 0.008));
+    }
+    samples
+}
+
+/// Standard deviation, per axis, about quadratics over runs of 9 readings.
+fn local_deviation(track: &[(f64, Vector3<f64>)]) -> f64 {
+    let mut variances: Vec<f64> = track.chunks_exact(9).filter_map(run_variance).collect();
+    if variances.is_empty() {
+        return 0.0;
+    }
+    let middle = variances.len() / 2;
+    variances.sort_by(f64::total_cmp);
+    // The median of a χ² of 18 degrees of freedom is .963 of its mean.
+    (variances[middle] / 0.963).sqrt()
+}
+
+fn run_variance(run: &[(f64, Vector3<f64>)]) -> Option<f64> {
+    let middle = run[run.len() / 2].0;
+    let scale = (run[run.len() - 1].0 - run[0].0).max(1e-6);
+    let row = |t: f64| Vector3::new(1.0, (t - middle) / scale, ((t - middle) / scale).powi(2));
+    let mut matrix = Matrix3::zeros();
+    let mut right = Matrix3::zeros();
+    for (t, x) in run {
+        matrix += row(*t) * row(*t).transpose();
+        right += row(*t) * x.transpose();
+    }
+    let solution = matrix.try_inverse()? * right;
+    let squares: f64 = run.iter().map(|(t, x)| (solution.transpose() * row(*t) - x).norm_squared()).sum();
+    Some(squares / (3.0 * (run.len() as f64 - 3.0)))
+}
+
+/// Information A and A · q of the moving joints, about `position`.
+struct Located {
+    information: DMatrix<f64>,
+    weighted: DVector<f64>,
+    position: DVector<f64>,
+}
+
+impl Located {
+    /// Lᵀ q = L⁻¹ (A q) with A = L Lᵀ: smooth in what A is made of.
+    fn whitened(&self) -> Option<(DMatrix<f64>, DVector<f64>)> {
+        let ridge = 1e-6 * self.information.diagonal().max() + 1e-9;
+        let mut matrix = self.information.clone();
+        let mut right = self.weighted.clone();
+        for i in 0..matrix.nrows() {
+            matrix[(i, i)] += ridge;
+            right[i] += ridge * self.position[i];
+        }
+        if self.information.diagonal().max() <= 0.0 {
+            return None;
+        }
+        let lower = matrix.cholesky()?.unpack();
+        let value = lower.solve_lower_triangular(&right)?;
+        Some((lower.transpose(), value))
+    }
+}
+
+/// Bins of the tool's track as information about the moving joints.
+fn tool_information(
+    source: &TrackSource<'_>,
+    kinematics: &TrackKinematics,
+    touched: usize,
+    point: Option<Vector3<f64>>,
+    tool: &[(f64, Vector3<f64>)],
+) -> Vec<(f64, Located)> {
+    let mut bins: Vec<(f64, Vector3<f64>, f64)> = Vec::new();
+    let mut start = 0;
+    for i in 0..=tool.len() {
+        if i == tool.len() || tool[i].0 - tool[start].0 >= BIN_S {
+            let count = (i - start) as f64;
+            if i > start {
+                let run = &tool[start..i];
+                let time_s = run.iter().map(|(t, _)| t).sum::<f64>() / count;
+                bins.push((time_s, run.iter().map(|(_, x)| x).sum::<Vector3<f64>>() / count, count));
+            }
+            start = i;
+        }
+    }
+    let deviation = local_deviation(tool).max(LEAST_TOOL_DEVIATION);
+    let mut positions: Vec<Vec<f64>> = bins.iter().map(|(t, _, _)| source.positions_at(*t)).collect();
+    let carried = |q: &[f64], x: &Vector3<f64>| {
+        source.displacements(&kinematics.axes, q)[touched].inverse().transform_point(&(x - kinematics.tool_offset))
+    };
+    let mean_point = |positions: &[Vec<f64>]| {
+        let sum: Vector3<f64> = bins.iter().zip(positions).map(|((_, x, _), q)| carried(q, x)).sum();
+        sum / bins.len().max(1) as f64
+    };
+    let mut point = point.unwrap_or_else(|| mean_point(&positions));
+    let n = source.moving.len();
+    // What the clouds said of a joint's position, for directions the tool does not see.
+    let anchor = DMatrix::identity(n, n) * 1e-3;
+    let mut result = Vec::new();
+    for round in 0..4 {
+        result.clear();
+        for ((time_s, x, count), q) in bins.iter().zip(&mut positions) {
+            let variance = deviation * deviation / count;
+            let displacements = source.displacements(&kinematics.axes, q);
+            let moved = displacements[touched].transform_point(&point);
+            let residual = x - kinematics.tool_offset - moved;
+            let columns: Vec<Vector3<f64>> = source
+                .twists(&kinematics.axes, &displacements, touched)
+                .iter()
+                .map(|v| Vector3::new(v[0], v[1], v[2]).cross(&moved) + Vector3::new(v[3], v[4], v[5]))
+                .collect();
+            let information = DMatrix::from_fn(n, n, |i, j| columns[i].dot(&columns[j]) / variance);
+            let slope = DVector::from_fn(n, |i, _| columns[i].dot(&residual) / variance);
+            let position = DVector::from_fn(n, |i, _| q[source.moving[i]]);
+            let regular = &information + &anchor * information.diagonal().max();
+            let step = regular.cholesky().map_or_else(|| DVector::zeros(n), |c| c.solve(&slope));
+            let weighted = &information * &position + &slope;
+            for (i, &joint) in source.moving.iter().enumerate() {
+                q[joint] += step[i].clamp(-0.2, 0.2);
+            }
+            if round == 3 {
+                let position = DVector::from_fn(n, |i, _| q[source.moving[i]]);
+                result.push((*time_s, Located { information, weighted, position }));
+            }
+        }
+        point = mean_point(&positions);
+    }
+    result
+}
+
+/// Part poses as information about the moving joints, at every frame.
+fn frame_information(source: &TrackSource<'_>, kinematics: &TrackKinematics) -> Vec<(f64, Located)> {
+    let n = source.moving.len();
+    let frames = source.window.times_s.len();
+    let all: Vec<Vec<Pose>> = (0..frames)
+        .map(|k| {
+            let q: Vec<f64> = source.positions.iter().map(|p| p[k]).collect();
+            source.displacements(&kinematics.axes, &q)
+        })
+        .collect();
+    (0..frames)
+        .map(|k| {
+            let mut located = Located {
+                information: DMatrix::zeros(n, n),
+                weighted: DVector::zeros(n),
+                position: DVector::from_fn(n, |i, _| source.positions[source.moving[i]][k]),
+            };
+            for (j, joint) in source.joints.iter().enumerate() {
+                let Some(measured) = source.window.poses.get(&joint.child).and_then(|p| p.get(k).copied().flatten()) else { continue };
+                let twists = source.twists(&kinematics.axes, &all[k], j);
+                if twists.iter().all(|t| *t == Vector6::zeros()) {
+                    continue;
+                }
+                let here = place(joint, &all[k][j]);
+                let sharing = all.iter().filter(|d| (place(joint, &d[j]) - here).norm() < SHARED_DISTANCE).count();
+                let information = shared(&measured.information, joint.radius, sharing as f64);
+                let residual = (Pose::from_translation(-joint.center) * measured.displacement.inverse() * all[k][j]
+                    * Pose::from_translation(joint.center))
+                .log();
+                let weight = (STUDENT_FREEDOM + 6.0) / (STUDENT_FREEDOM + residual.dot(&(information * residual)));
+                let into_body = (Pose::from_translation(-joint.center) * all[k][j].inverse()).adjoint_matrix();
+                let columns: Vec<Vector6<f64>> = twists.iter().map(|t| into_body * t).collect();
+                for a in 0..n {
+                    located.weighted[a] -= weight * columns[a].dot(&(information * residual));
+                    for b in 0..n {
+                        located.information[(a, b)] += weight * columns[a].dot(&(information * columns[b]));
+                    }
+                }
+            }
+            located.weighted += &located.information * &located.position;
+            (source.window.times_s[k], located)
+        })
+        .collect()
+}
+
+/// A part's place with its turn made comparable \[m\].
+fn place(joint: &KinematicJoint, pose: &Pose) -> Vector6<f64> {
+    let turned = pose.rotation * Vector3::repeat(joint.radius / 3f64.sqrt());
+    let center = pose.transform_point(&joint.center);
+    Vector6::new(center.x, center.y, center.z, turned.x, turned.y, turned.z)
+}
+
+/// Information with the error that `sharing` frames have in common.
+fn shared(raw: &Matrix6<f64>, radius: f64, sharing: f64) -> Matrix6<f64> {
+    let scale = Vector6::new(radius, radius, radius, 1.0, 1.0, 1.0);
+    let scaled = Matrix6::from_fn(|i, j| raw[(i, j)] / (scale[i] * scale[j]));
+    let mut eigen = scaled.symmetric_eigen();
+    let floor = sharing * SHARED_ERROR * SHARED_ERROR;
+    eigen.eigenvalues.apply(|x| *x = if *x > 0.0 { 1.0 / (1.0 / *x + floor) } else { 0.0 });
+    let clean = eigen.recompose();
+    Matrix6::from_fn(|i, j| clean[(i, j)] * scale[i] * scale[j])
+}
+
+/// The touched label of a window's contacts, if any.
+pub fn touched_label(contacts: &[Contact]) -> Option<Label> {
+    contacts.iter().find(|c| !c.track.is_empty()).map(|c| c.label)
+}
