@@ -12,6 +12,8 @@ const GRID_POINTS: usize = 60;
 const STEP_COST: f64 = 0.004;
 /// Grid steps that a joint can move between frames.
 const MOST_STEPS: usize = 12;
+/// Paths that cost this much more than the best, per point, are given up.
+const BEAM: f64 = 1.5;
 /// A tool further than this from where the joint puts it says no more \[m\].
 const TOOL_CAP: f64 = 0.030;
 
@@ -53,31 +55,34 @@ pub fn search_path(
     let mut unary: Vec<Vec<f64>> = Vec::with_capacity(frames.len());
     for frame in frames {
         let stride = (frame.scan.len() / GRID_POINTS).max(1);
-        let costs: Vec<f64> = places
-            .iter()
-            .map(|place| {
-                let displacement = frame.parent * *place;
-                let mut cost = truncated_cost(model, frame.scan, stride, &displacement);
-                if let (Some(tool), Some(point)) = (frame.tool, contact_point) {
-                    let miss = (displacement.transform_point(point) - tool).norm().min(TOOL_CAP);
-                    cost += 0.5 * (miss / 0.010).powi(2);
-                }
-                cost
-            })
-            .collect();
+        let cost_of = |place: &Pose| {
+            let displacement = frame.parent * *place;
+            let mut cost = truncated_cost(model, frame.scan, stride, &displacement);
+            if let (Some(tool), Some(point)) = (frame.tool, contact_point) {
+                let miss = (displacement.transform_point(point) - tool).norm().min(TOOL_CAP);
+                cost += 0.5 * (miss / 0.010).powi(2);
+            }
+            cost
+        };
+        // Only paths near the best so far are followed: the rest of the grid is not looked at.
+        let leader = best.iter().copied().fold(f64::INFINITY, f64::min);
         let mut next = vec![f64::INFINITY; count];
         let mut from = vec![0; count];
-        for g in 0..count {
-            for other in g.saturating_sub(MOST_STEPS)..=(g + MOST_STEPS).min(count - 1) {
-                let value = best[other] + STEP_COST * g.abs_diff(other) as f64;
-                if value < next[g] {
-                    (next[g], from[g]) = (value, other);
+        for (g, &value) in best.iter().enumerate().filter(|(_, value)| **value <= leader + BEAM) {
+            let reach = if came_from.is_empty() { 0 } else { MOST_STEPS };
+            for other in g.saturating_sub(reach)..=(g + reach).min(count - 1) {
+                let reached = value + STEP_COST * g.abs_diff(other) as f64;
+                if reached < next[other] {
+                    (next[other], from[other]) = (reached, g);
                 }
             }
-            next[g] += costs[g];
         }
-        if came_from.is_empty() {
-            next.clone_from(&costs);
+        let mut costs = vec![f64::INFINITY; count];
+        for (g, place) in places.iter().enumerate().filter(|(g, _)| next[*g].is_finite()) {
+            costs[g] = cost_of(place);
+        }
+        for (value, cost) in next.iter_mut().zip(&costs) {
+            *value += cost;
         }
         best = next;
         came_from.push(from);

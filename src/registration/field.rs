@@ -7,7 +7,7 @@ use super::Surfel;
 /// Edge of a cell \[m\].
 const CELL: f64 = 0.010;
 /// How far from the surface the look-up reaches \[m\].
-pub const REACH: f64 = 0.060;
+pub const REACH: f64 = 0.045;
 const NONE: u32 = u32::MAX;
 /// Cells at most; larger parts get coarser cells.
 const MOST_CELLS: f64 = 4e6;
