@@ -2,6 +2,7 @@
 //!
 //! `cargo run --release --example tree_guides`; the table is in `docs/structure.md`.
 #![allow(clippy::print_stdout, reason = "the table is what this program is for")]
+#![allow(clippy::disallowed_methods, reason = "it times what it compares")]
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};

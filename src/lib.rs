@@ -23,5 +23,6 @@ pub mod mechanism;
 pub mod model;
 pub mod pipeline;
 pub mod registration;
+pub mod report;
 pub mod structure;
 pub mod types;

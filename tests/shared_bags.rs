@@ -1,5 +1,5 @@
 //! The simulated bags beside this repository are read whole: every message becomes an input.
-#![allow(clippy::unwrap_used, clippy::print_stderr)]
+#![allow(clippy::unwrap_used, clippy::print_stderr, clippy::disallowed_methods)]
 
 use std::{
     collections::BTreeSet,

@@ -10,7 +10,11 @@ use std::{
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 use thiserror::Error;
 
-use crate::types::Label;
+use crate::{
+    model::KinematicSettings,
+    pipeline::{PipelineSettings, WindowSettings},
+    types::Label,
+};
 
 /// Why there is no configuration.
 #[derive(Debug, Error)]
@@ -45,6 +49,14 @@ pub struct Config {
     pub gravity_m_s2: [f64; 3],
     /// Topics, frames and what to make of them.
     pub input: InputConfig,
+    /// A posterior counts from its window's close plus this, in stamp time \[s\].
+    pub posterior_latency_s: f64,
+    /// When interaction windows open and close.
+    pub windows: WindowSettings,
+    /// What counts as an observation.
+    pub observations: ObservationConfig,
+    /// What is assumed of pose measurements.
+    pub kinematics: KinematicSettings,
 }
 
 impl Default for Config {
@@ -53,11 +65,26 @@ impl Default for Config {
             seed: 0,
             gravity_m_s2: [0.0, 0.0, -9.81],
             input: InputConfig::default(),
+            posterior_latency_s: 0.0,
+            windows: WindowSettings::default(),
+            observations: ObservationConfig::default(),
+            kinematics: KinematicSettings::default(),
         }
     }
 }
 
 impl Config {
+    /// What the pipeline needs of it; `root` is the part fixed to the world, if known.
+    pub fn pipeline_settings(&self, root: Option<Label>) -> PipelineSettings {
+        PipelineSettings {
+            root,
+            use_tool: self.observations.tool_pose,
+            windows: self.windows,
+            kinematics: self.kinematics,
+            gravity_in_world: self.gravity_m_s2.into(),
+        }
+    }
+
     /// Reads a file.
     ///
     /// # Errors
@@ -114,7 +141,66 @@ impl Config {
                 format!("{:?}, expected at most 100 m/s²", self.gravity_m_s2),
             ));
         }
+        let positive = [
+            ("windows.force_threshold_n", self.windows.force_threshold_n),
+            ("windows.smoothing_s", self.windows.smoothing_s),
+            ("windows.quiet_s", self.windows.quiet_s),
+            ("windows.longest_s", self.windows.longest_s),
+            (
+                "kinematics.tool_offset_sigma",
+                self.kinematics.tool_offset_sigma,
+            ),
+            ("kinematics.shared_error", self.kinematics.shared_error),
+            (
+                "kinematics.shared_distance",
+                self.kinematics.shared_distance,
+            ),
+            (
+                "kinematics.rest_deviations",
+                self.kinematics.rest_deviations,
+            ),
+            (
+                "kinematics.student_freedom",
+                self.kinematics.student_freedom,
+            ),
+            ("kinematics.steps", self.kinematics.steps as f64),
+        ];
+        positive
+            .into_iter()
+            .try_for_each(|(key, value)| positive_number(key, value))?;
+        for (key, value) in [
+            ("posterior_latency_s", self.posterior_latency_s),
+            ("windows.lead_s", self.windows.lead_s),
+        ] {
+            if !(0.0..=1e6).contains(&value) {
+                return Err((key.into(), format!("{value}, expected 0 to 1e6")));
+            }
+        }
         self.input.check()
+    }
+}
+
+fn positive_number(key: &str, value: f64) -> Result<(), (String, String)> {
+    if value > 0.0 && value <= 1e6 {
+        return Ok(());
+    }
+    Err((
+        key.into(),
+        format!("{value}, expected above 0 and at most 1e6"),
+    ))
+}
+
+/// What counts as an observation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ObservationConfig {
+    /// The tool's position measures the part that it holds.
+    pub tool_pose: bool,
+}
+
+impl Default for ObservationConfig {
+    fn default() -> Self {
+        Self { tool_pose: true }
     }
 }
 
@@ -212,12 +298,7 @@ impl InputConfig {
                 self.default_pose_std.position_m,
             ),
         ] {
-            if !(value > 0.0 && value <= 1e6) {
-                return Err((
-                    key.into(),
-                    format!("{value}, expected above 0 and at most 1e6"),
-                ));
-            }
+            positive_number(key, value)?;
         }
         if self.poses.matches("{label}").count() != 1 {
             return Err((

@@ -12,6 +12,7 @@ use std::collections::BTreeMap;
 use std::rc::Rc;
 
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
+use serde::{Deserialize, Serialize};
 
 use super::window::{Contact, PoseMeasurement, WindowObservations};
 use crate::math::{Pose, Screw, orthonormal_pair};
@@ -125,7 +126,8 @@ impl KinematicJoint {
 }
 
 /// What is assumed of the measurements.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct KinematicSettings {
     /// Standard deviation of the tool's constant offset, per axis \[m\].
     pub tool_offset_sigma: f64,

@@ -82,8 +82,6 @@ pub struct Learner {
     pub dynamics: DynamicsLearner,
     /// What learning each window's dynamics gave.
     pub inferences: Vec<WindowInference>,
-    /// Temporary: wall time of that \[s\].
-    pub dynamics_wall_s: Vec<f64>,
     /// Hulls of the parts, as first seen.
     pub hulls: BTreeMap<Label, HullProperties>,
 }
@@ -108,7 +106,6 @@ impl Learner {
             settings: KinematicSettings::default(),
             dynamics: DynamicsLearner::new(Vector3::new(0.0, 0.0, -9.81)),
             inferences: Vec::new(),
-            dynamics_wall_s: Vec::new(),
             hulls: BTreeMap::new(),
         }
     }
@@ -189,9 +186,7 @@ impl Learner {
         let Some(fit) = &self.fit else { return };
         let windows: Vec<&WindowObservations> = self.windows.iter().collect();
         let input = DynamicsInput { windows: &windows, contacts: &job.contacts, zero: job.zero, parts: &self.hulls, use_tool: self.use_tool };
-        let begin = std::time::Instant::now();
         self.inferences.push(self.dynamics.learn_window(fit, &input));
-        self.dynamics_wall_s.push(begin.elapsed().as_secs_f64());
     }
 
     /// Measures a part's poses in the last window, about its track.

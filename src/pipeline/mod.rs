@@ -2,7 +2,9 @@
 
 mod explain;
 mod learner;
+mod posterior;
 mod windows;
+mod working_frame;
 
 use std::collections::BTreeMap;
 
@@ -13,11 +15,12 @@ pub use learner::{Learner, ParentEvidence, WindowJob};
 pub use windows::{FrameAssembler, WindowCutter, WindowSettings};
 
 use crate::math::Pose;
-use crate::model::PoseMeasurement;
+use crate::model::{DynamicsLearner, KinematicSettings, PoseMeasurement};
 use crate::registration::{AlignmentSettings, Quadratic, SurfelAccumulator, align, truncated_cost};
 use crate::types::{Input, Label, Stamp};
 use explain::{FEWEST_POINTS, measurement_of, travel};
 use windows::frame_of;
+use working_frame::WorkingFrame;
 
 /// Frames of the first look that the reference models are made of.
 const REFERENCE_FRAMES: usize = 20;
@@ -33,6 +36,10 @@ pub struct PipelineSettings {
     pub use_tool: bool,
     /// When windows open and close.
     pub windows: WindowSettings,
+    /// What is assumed of the pose measurements.
+    pub kinematics: KinematicSettings,
+    /// Gravity in world \[m/s²\].
+    pub gravity_in_world: Vector3<f64>,
 }
 
 /// What the pipeline says.
@@ -57,6 +64,7 @@ pub enum Output {
 /// From inputs to outputs; the same for a recorded and a live stream.
 pub struct Pipeline {
     settings: PipelineSettings,
+    working_frame: WorkingFrame,
     zero: Option<Stamp>,
     assembler: FrameAssembler,
     early: Vec<Input>,
@@ -74,6 +82,7 @@ impl Pipeline {
     pub fn new(settings: PipelineSettings) -> Self {
         Self {
             settings,
+            working_frame: WorkingFrame::Open(Vec::new()),
             zero: None,
             assembler: FrameAssembler::default(),
             early: Vec::new(),
@@ -92,8 +101,8 @@ impl Pipeline {
         self.learner.as_ref()
     }
 
-    /// Takes one input, in the order of arrival.
-    pub fn push(&mut self, input: Input) -> Vec<Output> {
+    /// One input, in the working frame.
+    fn push_carried(&mut self, input: Input) -> Vec<Output> {
         match input {
             Input::Cloud(cloud) => {
                 let ready = self.assembler.push(cloud);
@@ -109,8 +118,8 @@ impl Pipeline {
         }
     }
 
-    /// Ends the stream: what is open is closed and learned.
-    pub fn finish(&mut self) -> Vec<Output> {
+    /// The end of the stream, in the working frame.
+    fn finish_carried(&mut self) -> Vec<Output> {
         let mut outputs = Vec::new();
         for (stamp, clouds) in self.assembler.flush() {
             outputs.extend(self.push_frame(stamp, &clouds));
@@ -160,6 +169,8 @@ impl Pipeline {
             accumulators.iter().max_by_key(|(_, a)| a.voxel_means(1.0).len()).map_or(Label(0), |(l, _)| *l)
         });
         let mut learner = Learner::new(root, self.settings.use_tool, accumulators);
+        learner.settings = self.settings.kinematics;
+        learner.dynamics = DynamicsLearner::new(self.gravity_in_work());
         learner.calibrate(&self.reference);
         self.reference.clear();
         self.learner = Some(learner);

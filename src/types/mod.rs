@@ -1,5 +1,8 @@
 //! What flows between the layers: stamps, labels, clouds, wrenches, poses with information.
 
+pub mod finite;
+pub mod posterior;
+
 use std::fmt;
 
 use nalgebra::{Matrix6, Vector3};

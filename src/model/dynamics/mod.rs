@@ -14,4 +14,4 @@ mod tests;
 mod track;
 
 pub use learner::{DynamicsInput, DynamicsLearner, WindowInference};
-pub use posterior::{DynamicsPosterior, Informed, JointDynamics, PartDynamics, Quantity};
+pub use posterior::{DynamicsPosterior, JointDynamics, PartDynamics};

@@ -1,74 +1,13 @@
 //! The posterior of the dynamics, as it is published.
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
-use serde::{Deserialize, Serialize};
 
 use super::layout::{DAMPING, FRICTION, INERTIA, LOWER, MASS, MOMENT, UPPER};
 use super::learner::{Block, DynamicsLearner};
 use crate::inference::Failure;
 use crate::mechanism::JointType;
 use crate::types::Label;
-
-/// What a number was learned from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Informed {
-    /// How the object moved.
-    Dynamics,
-    /// Shapes and assumptions only.
-    Prior,
-}
-
-/// A number with its distribution.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Quantity {
-    /// SI unit.
-    pub unit: String,
-    /// Half of the probability is below it.
-    pub median: f64,
-    /// Expectation.
-    pub mean: f64,
-    /// Standard deviation.
-    pub std: f64,
-    /// The central 90 % begin here,
-    pub q05: f64,
-    /// and end here.
-    pub q95: f64,
-    /// Where it comes from.
-    pub informed_by: Informed,
-}
-
-/// The 95 % quantile of the standard normal.
-const Q95: f64 = 1.644_853_626_951_472;
-
-impl Quantity {
-    /// exp of N(mean, deviation²).
-    pub fn log_normal(unit: &str, mean: f64, deviation: f64, informed_by: Informed) -> Self {
-        let expectation = (mean + 0.5 * deviation * deviation).exp();
-        Self {
-            unit: unit.into(),
-            median: mean.exp(),
-            mean: expectation,
-            std: expectation * (deviation * deviation).exp_m1().max(0.0).sqrt(),
-            q05: (mean - Q95 * deviation).exp(),
-            q95: (mean + Q95 * deviation).exp(),
-            informed_by,
-        }
-    }
-
-    /// N(mean, deviation²).
-    pub fn normal(unit: &str, mean: f64, deviation: f64, informed_by: Informed) -> Self {
-        Self {
-            unit: unit.into(),
-            median: mean,
-            mean,
-            std: deviation,
-            q05: mean - Q95 * deviation,
-            q95: mean + Q95 * deviation,
-            informed_by,
-        }
-    }
-}
+use crate::types::posterior::{InformedBy, Quantity};
 
 /// Of one joint.
 #[derive(Clone, Debug, PartialEq)]
@@ -131,17 +70,17 @@ impl DynamicsLearner {
             let at = self.mechanism.offset(k);
             let deviation = |entry: usize| posterior.covariance[(at + entry, at + entry)].max(0.0).sqrt();
             let informed = |entry: usize, deviation: f64| match prior_deviation(k, entry) {
-                Some(prior) if deviation < 0.7 * prior => Informed::Dynamics,
-                _ => Informed::Prior,
+                Some(prior) if deviation < 0.7 * prior => InformedBy::Dynamics,
+                _ => InformedBy::Prior,
             };
             let revolute = model.joint.joint_type == JointType::Revolute;
             let units = if revolute { ["N·m·s/rad", "N·m", "kg·m²", "rad"] } else { ["N·s/m", "N", "kg", "m"] };
             let log_normal = |unit: &str, entry: usize| {
-                Quantity::log_normal(unit, posterior.mean[at + entry], deviation(entry), informed(entry, deviation(entry)))
+                Quantity::from_log_normal(unit, posterior.mean[at + entry], deviation(entry), informed(entry, deviation(entry)))
             };
             let stop = |side: usize, entry: usize| {
                 model.stops[side].then(|| {
-                    Quantity::normal(units[3], posterior.mean[at + entry], deviation(entry), Informed::Dynamics)
+                    Quantity::from_normal(units[3], posterior.mean[at + entry], deviation(entry), InformedBy::Dynamics)
                 })
             };
             let (inertia, inertia_deviation) = self.joint_inertia(k, &posterior.mean, &posterior.covariance)?;
@@ -149,7 +88,7 @@ impl DynamicsLearner {
                 label: model.joint.child,
                 damping: log_normal(units[0], DAMPING),
                 friction: log_normal(units[1], FRICTION),
-                joint_inertia: Quantity::log_normal(
+                joint_inertia: Quantity::from_log_normal(
                     units[2],
                     inertia,
                     inertia_deviation,

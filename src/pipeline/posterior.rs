@@ -1,0 +1,233 @@
+//! The posterior as it is published: what the learner knows, over all trees.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use nalgebra::{DMatrix, Matrix3, Vector3};
+
+use super::{Learner, ParentEvidence, Pipeline};
+use crate::geometry::hull_properties;
+use crate::mechanism::JointType;
+use crate::model::{Axis, DynamicsPosterior, JointDynamics, KinematicFit, WindowInference, WindowObservations};
+use crate::structure::TreeDistribution;
+use crate::types::Label;
+use crate::types::posterior::{
+    Criticism, EdgePosterior, InformedBy, JointTypeProbabilities, ObjectPosterior, PartPosterior, PrismaticAxis,
+    Quantity, RevoluteAxis, WindowRecord,
+};
+
+/// Density of furniture parts over their hull, median \[kg/m³\] and standard deviation of its log:
+/// hollow drawers weigh 100, boards 600.
+const HULL_DENSITY: (f64, f64) = (250.0, 0.9);
+/// The centre of mass of a part lies this share of its spread away from its hull's, per axis.
+const CENTER_SHARE: f64 = 0.3;
+
+impl Pipeline {
+    /// What is believed now, in the working frame.
+    pub(super) fn posterior_in_work(&self) -> Option<ObjectPosterior> {
+        let points = self.points();
+        let root = match (&self.learner, self.settings.root) {
+            (Some(learner), _) => learner.root,
+            (None, Some(root)) => root,
+            (None, None) => points.iter().max_by_key(|(_, points)| points.len()).map(|(label, _)| *label)?,
+        };
+        let labels: Vec<Label> = points.keys().copied().collect();
+        let mut parts: Vec<PartPosterior> = points.iter().filter_map(|(label, points)| part(*label, points)).collect();
+        let dynamics = self.learner.as_ref().and_then(|learner| learner.dynamics.posterior().ok());
+        for learned in dynamics.iter().flat_map(|dynamics| &dynamics.parts) {
+            if let Some(part) = parts.iter_mut().find(|part| part.label == learned.label) {
+                part.com_in_world_m = learned.com_in_world.into();
+                part.com_covariance_m2 = learned.com_covariance.into();
+                part.mass_kg = learned.mass.clone();
+            }
+        }
+        let known = self.learner.as_ref().map(|learner| Known { learner, dynamics: dynamics.as_ref() });
+        Some(ObjectPosterior {
+            root_label: root,
+            parts,
+            edges: edges(root, &labels, known),
+            windows: self.learner.as_ref().map(window_records).unwrap_or_default(),
+            criticism: Criticism::insufficient(),
+        })
+    }
+
+    /// Points of each part's surface at the reference configuration \[m\].
+    fn points(&self) -> BTreeMap<Label, Vec<Vector3<f64>>> {
+        if let Some(learner) = &self.learner {
+            return learner
+                .models
+                .iter()
+                .map(|(label, model)| (*label, model.surfels.iter().map(|s| s.point).collect()))
+                .collect();
+        }
+        let mut points: BTreeMap<Label, Vec<Vector3<f64>>> = BTreeMap::new();
+        let last = self.reference.last().into_iter().flat_map(|frame| &frame.scans);
+        for (label, scan) in last {
+            points.entry(*label).or_default().extend(scan.iter().map(|p| p.point_in_world));
+        }
+        points
+    }
+}
+
+fn part(label: Label, points: &[Vector3<f64>]) -> Option<PartPosterior> {
+    let hull = hull_properties(points, None)?;
+    // The same in all directions: the hull's spread is along the world's axes, which mean nothing to the part.
+    let variance = CENTER_SHARE.powi(2) * hull.spread.norm_squared() / 3.0;
+    let covariance = Matrix3::from_diagonal_element(variance);
+    let (density, log_sd) = HULL_DENSITY;
+    Some(PartPosterior {
+        label,
+        com_in_world_m: hull.center.into(),
+        com_covariance_m2: covariance.into(),
+        mass_kg: Quantity::from_log_normal("kg", (density * hull.volume).ln(), log_sd, InformedBy::Prior),
+    })
+}
+
+/// What the edges are made of.
+#[derive(Clone, Copy)]
+struct Known<'a> {
+    learner: &'a Learner,
+    dynamics: Option<&'a DynamicsPosterior>,
+}
+
+fn window_records(learner: &Learner) -> Vec<WindowRecord> {
+    // The first windows may have had no joint to infer the dynamics of.
+    let without = learner.windows.len().saturating_sub(learner.inferences.len());
+    let inferences = std::iter::repeat_n(None, without).chain(learner.inferences.iter().map(Some));
+    learner.windows.iter().zip(inferences).map(|(window, inference)| window_record(window, inference)).collect()
+}
+
+fn window_record(window: &WindowObservations, inference: Option<&WindowInference>) -> WindowRecord {
+    let touched: BTreeSet<Label> = window.contacts.iter().map(|contact| contact.label).collect();
+    let end = |time: Option<&f64>| time.copied().unwrap_or_default();
+    let learned = inference.filter(|inference| inference.failure.is_none());
+    WindowRecord {
+        t0_s: end(window.times_s.first()),
+        t1_s: end(window.times_s.last()),
+        labels: touched.into_iter().collect(),
+        frames: window.times_s.len(),
+        steps: inference.map_or(0, |inference| inference.steps),
+        inference_wall_s: 0.0,
+        elbo: learned.map(|inference| inference.elbo),
+        log_predictive_density: learned.map(|inference| inference.log_predictive_density),
+    }
+}
+
+fn edges(root: Label, labels: &[Label], known: Option<Known<'_>>) -> Vec<EdgePosterior> {
+    let nodes: Vec<Label> = [root].into_iter().chain(labels.iter().copied().filter(|l| *l != root)).collect();
+    let evidence = |child: Label| known.and_then(|known| known.learner.evidence.get(&child));
+    let mut log_weights = DMatrix::zeros(nodes.len(), nodes.len());
+    for (j, child) in nodes.iter().enumerate().skip(1) {
+        let Some(options) = evidence(*child) else { continue };
+        for (i, parent) in nodes.iter().enumerate() {
+            let moved = evidence(*parent).is_some();
+            log_weights[(i, j)] =
+                option_for(options, *parent, moved).map_or(f64::NEG_INFINITY, |o| log_sum(&o.log_evidence));
+        }
+    }
+    let Ok(trees) = TreeDistribution::new(&log_weights) else { return Vec::new() };
+    let mut found = Vec::new();
+    for (j, child) in nodes.iter().enumerate().skip(1) {
+        for (i, parent) in nodes.iter().enumerate() {
+            let probability = trees.edge_marginals()[(i, j)];
+            if i == j || probability < ObjectPosterior::LEAST_PROBABILITY {
+                continue;
+            }
+            let option = evidence(*child).and_then(|options| option_for(options, *parent, evidence(*parent).is_some()));
+            found.push(edge(*parent, *child, probability, option, known));
+        }
+    }
+    found.sort_by_key(|e| (e.child, e.parent));
+    found
+}
+
+/// The evidence for a parent: all parts that never moved share that of the world.
+fn option_for(options: &[ParentEvidence], parent: Label, parent_moved: bool) -> Option<&ParentEvidence> {
+    options.iter().find(|o| o.parent == parent_moved.then_some(parent))
+}
+
+fn log_sum(terms: &[f64; 3]) -> f64 {
+    let top = terms.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    top + terms.iter().map(|t| (t - top).exp()).sum::<f64>().ln()
+}
+
+fn edge(
+    parent: Label,
+    child: Label,
+    probability: f64,
+    option: Option<&ParentEvidence>,
+    known: Option<Known<'_>>,
+) -> EdgePosterior {
+    let mut joint_type = JointTypeProbabilities::UNIFORM;
+    if let Some(option) = option {
+        let total = log_sum(&option.log_evidence);
+        let [rigid, prismatic, revolute] = option.log_evidence.map(|e| (e - total).exp());
+        joint_type = JointTypeProbabilities { rigid, prismatic, revolute };
+    }
+    let fitted = |joint_type| fitted_axis(option?, known?.learner, child, joint_type);
+    let revolute = fitted(JointType::Revolute).map(|(axis, covariance)| RevoluteAxis {
+        axis_direction: axis.direction.into(),
+        axis_point_m: axis.point.into(),
+        covariance: std::array::from_fn(|i| std::array::from_fn(|j| covariance[(i, j)])),
+    });
+    let prismatic = fitted(JointType::Prismatic).map(|(axis, covariance)| PrismaticAxis {
+        axis_direction: axis.direction.into(),
+        covariance: std::array::from_fn(|i| std::array::from_fn(|j| covariance[(i, j)])),
+    });
+    let prior = |unit: [&str; 2], median: f64| {
+        let unit = unit[usize::from(joint_type.revolute >= joint_type.prismatic)];
+        Quantity::from_log_normal(unit, median.ln(), 1.5, InformedBy::Prior)
+    };
+    let likelier = if joint_type.revolute >= joint_type.prismatic { JointType::Revolute } else { JointType::Prismatic };
+    let learned = option.and_then(|option| learned_dynamics(option, known?, child, likelier));
+    let from = |of: fn(&JointDynamics) -> &Quantity, unit, median| {
+        learned.map_or_else(|| prior(unit, median), |d| of(d).clone())
+    };
+    EdgePosterior {
+        parent,
+        child,
+        probability,
+        joint_type,
+        revolute,
+        prismatic,
+        damping: from(|d| &d.damping, ["N·s/m", "N·m·s/rad"], 2.0),
+        friction: from(|d| &d.friction, ["N", "N·m"], 1.0),
+        joint_inertia: from(|d| &d.joint_inertia, ["kg", "kg·m²"], 1.0),
+        lower_limit: learned.and_then(|d| d.lower_limit.clone()),
+        upper_limit: learned.and_then(|d| d.upper_limit.clone()),
+    }
+}
+
+/// The dynamics of the joint, if inference was run for this parent and type.
+fn learned_dynamics<'a>(
+    option: &ParentEvidence,
+    known: Known<'a>,
+    child: Label,
+    joint_type: JointType,
+) -> Option<&'a JointDynamics> {
+    index_in_fit(option, known.learner.fit.as_ref()?, child, joint_type)?;
+    known.dynamics?.joints.iter().find(|joint| joint.label == child)
+}
+
+/// Where the joint of this parent and type is in the joint fit.
+fn index_in_fit(option: &ParentEvidence, fit: &KinematicFit, child: Label, joint_type: JointType) -> Option<usize> {
+    fit.joints.iter().position(|joint| {
+        let parent = joint.parent.map(|p| fit.joints[p].child);
+        joint.child == child && joint.joint_type == joint_type && parent == option.parent
+    })
+}
+
+/// The axis by the joint fit where the edge is in it, else by its own.
+fn fitted_axis(
+    option: &ParentEvidence,
+    learner: &Learner,
+    child: Label,
+    joint_type: JointType,
+) -> Option<(Axis, DMatrix<f64>)> {
+    let own = option.fits[joint_type as usize].as_ref()?;
+    let wide = DMatrix::from_diagonal_element(4, 4, 1.0);
+    let Some(fit) = &learner.fit else { return Some((own.joint.axis, wide)) };
+    let Some(index) = index_in_fit(option, fit, child, joint_type) else { return Some((own.joint.axis, wide)) };
+    let joint = &fit.joints[index];
+    let (offset, count) = (fit.axis_offset(index), joint.axis_parameters());
+    Some((joint.axis, fit.covariance.view((offset, offset), (count, count)).into_owned()))
+}

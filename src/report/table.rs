@@ -1,0 +1,368 @@
+//! The table of what was found: at most 100 columns, part by part.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+
+use crate::io::counters::{ByReason, Counters};
+use crate::io::document::PosteriorDocument;
+use crate::types::Label;
+use crate::types::posterior::{
+    EdgePosterior, InformedBy, JointTypeProbabilities, ObjectPosterior, Quantity, WindowRecord,
+};
+
+/// A type less likely than this is open: what never moved stays so.
+const SETTLED: f64 = 0.9;
+
+/// A run, as the table tells it.
+#[derive(Clone, Copy, Debug)]
+pub struct Run<'a> {
+    /// What was read.
+    pub bag: &'a str,
+    /// What came out.
+    pub document: &'a PosteriorDocument,
+    /// Whether the root was given, not found.
+    pub root_is_given: bool,
+    /// From the first to the last stamp \[s\].
+    pub stream_s: f64,
+    /// How long it took \[s\].
+    pub wall_s: f64,
+    /// What was damaged, dropped or missing, a line each.
+    pub remarks: &'a [String],
+}
+
+/// The table, as lines.
+pub fn table(run: &Run<'_>) -> String {
+    let posterior = &run.document.posterior;
+    let labels = labels_of(posterior);
+    let mut text = format!("{}: {:.1} s of stream, {} parts\n\n", run.bag, run.stream_s, labels.len());
+    let found = Found::new(posterior);
+    let width = labels.iter().map(|label| label.to_string().len()).max().unwrap_or(1).max(4);
+    let margin = " ".repeat(2 * width + 11);
+    line(&mut text, &format!("{:>width$}  {:<on$}joint", "part", "on", on = width + 9));
+    for label in &labels {
+        if *label == posterior.root_label {
+            let how = if run.root_is_given { "given" } else { "found" };
+            line(&mut text, &format!("{label:>width$}  root ({how}), fixed to the world"));
+            continue;
+        }
+        let Some(joint) = found.joint(*label) else { continue };
+        let (name, type_probability) = joint.types.likeliest();
+        let on = format!("{:>width$} {:.3}", joint.edge.parent.to_string(), joint.probability);
+        if type_probability <= SETTLED {
+            let JointTypeProbabilities { rigid, prismatic, revolute } = joint.types;
+            line(
+                &mut text,
+                &format!(
+                    "{label:>width$}  {on}   open: rigid {rigid:.3}, prismatic {prismatic:.3}, revolute {revolute:.3}"
+                ),
+            );
+            continue;
+        }
+        line(&mut text, &format!("{label:>width$}  {on}   {name} {type_probability:.3}"));
+        for detail in details(joint.edge, name) {
+            line(&mut text, &format!("{margin}{detail}"));
+        }
+    }
+    if !found.at_rest.is_empty() && labels.len() > found.at_rest.len() + 1 {
+        let list: Vec<String> = found.at_rest.iter().map(Label::to_string).collect();
+        let (parts, them) = if list.len() == 1 { ("Part", "it") } else { ("Parts", "one of them") };
+        line(&mut text, "");
+        line(
+            &mut text,
+            &format!("{parts} {} never moved: a joint on {them} is shown as on the root.", list.join(", ")),
+        );
+    }
+    line(&mut text, "");
+    line(&mut text, &windows_line(&posterior.windows, run.stream_s, run.wall_s));
+    counter_lines(&mut text, &run.document.counters);
+    run.remarks.iter().for_each(|remark| line(&mut text, &format!("! {remark}")));
+    text
+}
+
+fn line(text: &mut String, content: &str) {
+    text.push_str(content.trim_end());
+    text.push('\n');
+}
+
+fn labels_of(posterior: &ObjectPosterior) -> Vec<Label> {
+    let ends = posterior.edges.iter().flat_map(|edge| [edge.parent, edge.child]);
+    let parts = posterior.parts.iter().map(|part| part.label);
+    let mut labels: Vec<Label> = ends.chain(parts).chain([posterior.root_label]).collect();
+    labels.sort_unstable();
+    labels.dedup();
+    labels
+}
+
+/// The edges by child, and which parts never moved.
+struct Found<'a> {
+    root: Label,
+    by_child: BTreeMap<Label, Vec<&'a EdgePosterior>>,
+    at_rest: Vec<Label>,
+}
+
+/// The joint that carries a part, as shown.
+struct Joint<'a> {
+    edge: &'a EdgePosterior,
+    probability: f64,
+    types: JointTypeProbabilities,
+}
+
+impl<'a> Found<'a> {
+    fn new(posterior: &'a ObjectPosterior) -> Self {
+        let mut by_child: BTreeMap<Label, Vec<&EdgePosterior>> = BTreeMap::new();
+        for edge in &posterior.edges {
+            by_child.entry(edge.child).or_default().push(edge);
+        }
+        let open = |edges: &Vec<&EdgePosterior>| types_over(edges).likeliest().1 <= SETTLED;
+        let at_rest = by_child.iter().filter(|(_, edges)| open(edges)).map(|(label, _)| *label).collect();
+        Self { root: posterior.root_label, by_child, at_rest }
+    }
+
+    /// The likeliest parent; the parts that never moved count as one with the root, which stands
+    /// for them: which of them carries a joint is beyond the data.
+    fn joint(&self, child: Label) -> Option<Joint<'a>> {
+        let edges = self.by_child.get(&child)?;
+        let rests = |label: Label| label == self.root || self.at_rest.contains(&label);
+        let with_root: f64 = edges.iter().filter(|edge| rests(edge.parent)).map(|edge| edge.probability).sum();
+        let likelier = |a: &&&EdgePosterior, b: &&&EdgePosterior| {
+            a.probability.total_cmp(&b.probability).then(b.parent.cmp(&a.parent))
+        };
+        let moving = edges.iter().filter(|edge| !rests(edge.parent)).max_by(likelier);
+        let types = types_over(edges);
+        match moving {
+            Some(edge) if edge.probability > with_root => Some(Joint { edge, probability: edge.probability, types }),
+            _ => {
+                let of_root = edges.iter().find(|edge| edge.parent == self.root);
+                let edge = of_root.or_else(|| edges.iter().filter(|edge| rests(edge.parent)).max_by(likelier))?;
+                Some(Joint { edge, probability: with_root, types })
+            }
+        }
+    }
+}
+
+/// The types of a part's joint, over all its parents.
+fn types_over(edges: &[&EdgePosterior]) -> JointTypeProbabilities {
+    let total: f64 = edges.iter().map(|edge| edge.probability).sum();
+    let mean = |of: fn(&JointTypeProbabilities) -> f64| {
+        edges.iter().map(|edge| edge.probability * of(&edge.joint_type)).sum::<f64>() / total.max(f64::MIN_POSITIVE)
+    };
+    JointTypeProbabilities {
+        rigid: mean(|t| t.rigid),
+        prismatic: mean(|t| t.prismatic),
+        revolute: mean(|t| t.revolute),
+    }
+}
+
+fn details(edge: &EdgePosterior, joint_type: &str) -> Vec<String> {
+    let mut lines = Vec::new();
+    let vector = |[x, y, z]: [f64; 3]| format!("({x:>7.3}, {y:>7.3}, {z:>7.3})");
+    let rms = |a: f64, b: f64| (0.5 * (a + b)).max(0.0).sqrt();
+    match joint_type {
+        "revolute" => {
+            if let Some(axis) = &edge.revolute {
+                let c = &axis.covariance;
+                let degrees = rms(c[0][0], c[1][1]).to_degrees();
+                let millimetres = 1e3 * rms(c[2][2], c[3][3]);
+                lines.push(format!("axis       {} ± {}°", vector(axis.axis_direction), significant(degrees)));
+                lines.push(format!("through    {} m ± {} mm", vector(axis.axis_point_m), significant(millimetres)));
+            }
+        }
+        "prismatic" => {
+            if let Some(axis) = &edge.prismatic {
+                let degrees = rms(axis.covariance[0][0], axis.covariance[1][1]).to_degrees();
+                lines.push(format!("axis       {} ± {}°", vector(axis.axis_direction), significant(degrees)));
+            }
+        }
+        _ => return lines,
+    }
+    for (name, quantity) in [("damping", &edge.damping), ("friction", &edge.friction), ("inertia", &edge.joint_inertia)]
+    {
+        lines.push(format!("{name:<9}{}", interval(quantity)));
+    }
+    for (name, limit) in [("lower end", &edge.lower_limit), ("upper end", &edge.upper_limit)] {
+        if let Some(limit) = limit {
+            lines.push(format!("{name}{}", interval(limit)));
+        }
+    }
+    lines
+}
+
+/// Median and 90 % interval.
+fn interval(q: &Quantity) -> String {
+    let source = if q.informed_by == InformedBy::Prior { ", assumed" } else { "" };
+    let [median, q05, q95] = [q.median, q.q05, q.q95].map(significant);
+    format!("{median:>9}  [{q05}, {q95}] {}{source}", q.unit)
+}
+
+/// Three significant digits.
+fn significant(x: f64) -> String {
+    let magnitude = x.abs();
+    match magnitude {
+        _ if magnitude == 0.0 => "0".to_owned(),
+        _ if !(1e-3..1e5).contains(&magnitude) => format!("{x:.2e}"),
+        _ => {
+            let decimals = (2 - magnitude.log10().floor() as i32).max(0) as usize;
+            format!("{x:.decimals$}")
+        }
+    }
+}
+
+fn windows_line(windows: &[WindowRecord], stream_s: f64, wall_s: f64) -> String {
+    let speed =
+        format!("{stream_s:.1} s of stream in {wall_s:.1} s: {:.1} times real time", stream_s / wall_s.max(1e-9));
+    let mut walls: Vec<f64> = windows.iter().map(|window| window.inference_wall_s).collect();
+    walls.sort_by(f64::total_cmp);
+    match walls[..] {
+        [] => format!("No interaction was seen: the posterior is the prior.\n{speed}"),
+        [.., longest] => {
+            let median = walls[walls.len() / 2];
+            let count = walls.len();
+            let plural = if count == 1 { "" } else { "s" };
+            format!(
+                "{count} interaction window{plural}, inference {median:.2} s at the median, {longest:.2} s at most\n{speed}"
+            )
+        }
+    }
+}
+
+fn counter_lines(text: &mut String, counters: &Counters) {
+    let reasons = |reasons: &ByReason| {
+        reasons.iter().map(|(reason, count)| format!("{reason} {count}")).collect::<Vec<_>>().join(", ")
+    };
+    let mut arrived = Vec::new();
+    let kinds = [
+        ("clouds", counters.clouds_in, &counters.clouds_dropped),
+        ("points", counters.points_in, &counters.points_dropped),
+        ("poses", counters.poses_in, &counters.poses_dropped),
+        ("wrenches", counters.wrenches_in, &counters.wrenches_dropped),
+        ("transforms", counters.tf_in, &counters.tf_dropped),
+    ];
+    for (name, count, _) in &kinds {
+        if *count > 0 {
+            arrived.push(format!("{count} {name}"));
+        }
+    }
+    let _ = writeln!(text, "read: {}", arrived.join(", "));
+    for (name, _, dropped) in kinds {
+        if !dropped.is_empty() {
+            let _ = writeln!(text, "{name} not used: {}", reasons(dropped));
+        }
+    }
+    if !counters.bag_damage.is_empty() {
+        let _ = writeln!(text, "damage in the bag: {}", reasons(&counters.bag_damage));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::types::posterior::{Criticism, PrismaticAxis, RevoluteAxis};
+
+    const OPEN: JointTypeProbabilities = JointTypeProbabilities::UNIFORM;
+    const HINGE: JointTypeProbabilities = JointTypeProbabilities { rigid: 0.0, prismatic: 0.004, revolute: 0.996 };
+    const SLIDE: JointTypeProbabilities = JointTypeProbabilities { rigid: 0.0, prismatic: 1.0, revolute: 0.0 };
+
+    fn edge(parent: u32, child: u32, probability: f64, joint_type: JointTypeProbabilities) -> EdgePosterior {
+        let log_normal = |unit, informed_by| Quantity::from_log_normal(unit, 0.3, 0.1, informed_by);
+        EdgePosterior {
+            parent: Label(parent),
+            child: Label(child),
+            probability,
+            joint_type,
+            revolute: Some(RevoluteAxis {
+                axis_direction: [0.0, -0.002, 1.0],
+                axis_point_m: [0.4121, -0.231, 0.5],
+                covariance: std::array::from_fn(|i| std::array::from_fn(|j| if i == j { 4e-6 } else { 0.0 })),
+            }),
+            prismatic: Some(PrismaticAxis { axis_direction: [1.0, 0.0, 0.0], covariance: [[1e-5, 0.0], [0.0, 1e-5]] }),
+            damping: log_normal("N·m·s/rad", InformedBy::Dynamics),
+            friction: log_normal("N·m", InformedBy::Dynamics),
+            joint_inertia: Quantity::from_log_normal("kg·m²", -8.0, 1.5, InformedBy::Prior),
+            lower_limit: None,
+            upper_limit: Some(Quantity::from_normal("rad", 1.52, 0.003, InformedBy::Dynamics)),
+        }
+    }
+
+    fn run_of(edges: Vec<EdgePosterior>, windows: Vec<WindowRecord>, remarks: &[String]) -> String {
+        let posterior = ObjectPosterior {
+            root_label: Label(3),
+            parts: Vec::new(),
+            edges,
+            windows,
+            criticism: Criticism::insufficient(),
+        };
+        let mut counters = Counters { clouds_in: 20, wrenches_in: 300, ..Counters::default() };
+        Counters::add(&mut counters.clouds_dropped, "unknown_frame", 2);
+        let document = PosteriorDocument::new(posterior, counters);
+        table(&Run { bag: "a.mcap", document: &document, root_is_given: true, stream_s: 30.0, wall_s: 3.0, remarks })
+    }
+
+    fn window(inference_wall_s: f64) -> WindowRecord {
+        WindowRecord {
+            t0_s: 0.0,
+            t1_s: 1.0,
+            labels: Vec::new(),
+            frames: 10,
+            steps: 3,
+            inference_wall_s,
+            elbo: None,
+            log_predictive_density: None,
+        }
+    }
+
+    #[test]
+    fn parts_at_rest_are_one_with_the_root() {
+        // Part 1 is on 3 or on 5, which never moved; part 2 slides on 1.
+        let edges = vec![
+            edge(3, 1, 0.4, HINGE),
+            edge(5, 1, 0.595, HINGE),
+            edge(2, 1, 0.005, HINGE),
+            edge(1, 2, 0.98, SLIDE),
+            edge(3, 2, 0.02, SLIDE),
+            edge(3, 5, 1.0, OPEN),
+        ];
+        let text = run_of(edges, vec![window(0.2), window(0.4), window(0.3)], &["/wrench: 2 s late".into()]);
+        let expected = "a.mcap: 30.0 s of stream, 4 parts
+
+part  on           joint
+   1     3 0.995   revolute 0.996
+                   axis       (  0.000,  -0.002,   1.000) ± 0.115°
+                   through    (  0.412,  -0.231,   0.500) m ± 2.00 mm
+                   damping       1.35  [1.15, 1.59] N·m·s/rad
+                   friction      1.35  [1.15, 1.59] N·m
+                   inertia    3.35e-4  [2.85e-5, 0.00396] kg·m², assumed
+                   upper end     1.52  [1.52, 1.52] rad
+   2     1 0.980   prismatic 1.000
+                   axis       (  1.000,   0.000,   0.000) ± 0.181°
+                   damping       1.35  [1.15, 1.59] N·m·s/rad
+                   friction      1.35  [1.15, 1.59] N·m
+                   inertia    3.35e-4  [2.85e-5, 0.00396] kg·m², assumed
+                   upper end     1.52  [1.52, 1.52] rad
+   3  root (given), fixed to the world
+   5     3 1.000   open: rigid 0.333, prismatic 0.333, revolute 0.333
+
+Part 5 never moved: a joint on it is shown as on the root.
+
+3 interaction windows, inference 0.30 s at the median, 0.40 s at most
+30.0 s of stream in 3.0 s: 10.0 times real time
+read: 20 clouds, 300 wrenches
+clouds not used: unknown_frame 2
+! /wrench: 2 s late
+";
+        assert_eq!(text, expected);
+        assert!(text.lines().all(|line| line.chars().count() <= 100));
+    }
+
+    #[test]
+    fn no_interaction_is_said() {
+        let text = run_of(vec![edge(3, 1, 1.0, OPEN)], Vec::new(), &[]);
+        assert!(text.contains("No interaction was seen: the posterior is the prior."), "{text}");
+        assert!(!text.contains("never moved"), "{text}");
+    }
+
+    #[test]
+    fn three_digits() {
+        let shown = [0.0, 0.012345, 1.0, -9.99, 123.4, 54321.0, 1e5, 1e-5].map(significant);
+        assert_eq!(shown, ["0", "0.0123", "1.00", "-9.99", "123", "54321", "1.00e5", "1.00e-5"]);
+    }
+}
