@@ -178,8 +178,9 @@ impl Learner {
     }
 
     fn learn_dynamics(&mut self, job: &WindowJob) {
-        for label in self.models.keys() {
-            if let Some(hull) = self.accumulators.get(label).and_then(|a| hull_properties(&a.voxel_means(3.0), None)) {
+        for (label, model) in &self.models {
+            let points: Vec<Vector3<f64>> = model.surfels.iter().map(|s| s.point).collect();
+            if let Some(hull) = hull_properties(&points, None) {
                 self.hulls.insert(*label, hull);
             }
         }
