@@ -17,6 +17,15 @@ fn main() {
     for i in ingest.flush() { pipeline.push(i).into_iter().for_each(handle); }
     pipeline.finish().into_iter().for_each(handle);
     let l = pipeline.learner().unwrap();
+    if let Some(p) = get("--dump") {
+        use std::fmt::Write;
+        let mut o = String::new();
+        for (w, win) in l.windows.iter().enumerate() { for (face, poses) in [&win.poses, &win.later_faces].into_iter().enumerate() { for (label, list) in poses { for (k, m) in list.iter().enumerate() { if let Some(m) = m {
+            let d = m.displacement; let c = l.models[label].centroid; let r = l.models[label].radius; let tr = l.tracks[label][w][k];
+            writeln!(o, "{w} {} {label} {face} {} {} {} {} {} {} {}", win.times_s[k], r, c.iter().map(|x| x.to_string()).collect::<Vec<_>>().join(" "), d.rotation.iter().map(|x| x.to_string()).collect::<Vec<_>>().join(" "), d.translation.iter().map(|x| x.to_string()).collect::<Vec<_>>().join(" "), tr.rotation.iter().map(|x| x.to_string()).collect::<Vec<_>>().join(" "), tr.translation.iter().map(|x| x.to_string()).collect::<Vec<_>>().join(" "), m.information.iter().map(|x| x.to_string()).collect::<Vec<_>>().join(" ")).unwrap();
+        } } } } }
+        std::fs::write(p, o).unwrap();
+    }
     let mut edges = vec![];
     let dynamics = l.dynamics.posterior();
     if let Err(e) = &dynamics { tracing::warn!("{e}"); }
