@@ -6,7 +6,7 @@
 //! noise does to the joints, times κ ≥ 1 for what the model misses. The innovations are then white
 //! with covariance S, and −½ Σ (eᵀ S⁻¹ e + ln |S|) is the log likelihood (Ljung, "System
 //! Identification", 1999, section 7.4; Kristensen, Madsen, Jørgensen, Automatica 40, 2004).
-//! Derivatives by forward mode, for fixed gains.
+//! Derivatives are for fixed gains, by forward mode for one joint.
 
 use nalgebra::{DMatrix, DVector};
 use num_dual::DualSVec64;
@@ -15,7 +15,7 @@ use super::layout::Mechanism;
 use super::track::JointTrack;
 use crate::inference::Failure;
 use crate::math::Real;
-use crate::mechanism::{State, WrenchSample, WrenchTrack, rollout};
+use crate::mechanism::{State, Tree, WrenchSample, WrenchTrack, rollout};
 use crate::model::Axis;
 
 /// Longest step of the simulation \[s\]: half a wrench sample; trajectories of the midpoint step
@@ -30,37 +30,6 @@ const FRICTION_SPAN_S: f64 = 0.02;
 /// Standard deviation of the first position \[m or rad\] and rate \[m/s or rad/s\].
 const FIRST_POSITION: f64 = 0.02;
 const FIRST_RATE: f64 = 0.1;
-
-/// A scalar that carries derivatives along up to `WIDTH` directions.
-pub trait Directional: Real {
-    /// How many directions.
-    const WIDTH: usize;
-    /// A value with its derivatives.
-    fn with_slopes(value: f64, slopes: impl Fn(usize) -> f64) -> Self;
-    /// The derivative along a direction.
-    fn slope(&self, direction: usize) -> f64;
-}
-
-impl Directional for f64 {
-    const WIDTH: usize = 0;
-    fn with_slopes(value: f64, _: impl Fn(usize) -> f64) -> Self {
-        value
-    }
-    fn slope(&self, _: usize) -> f64 {
-        0.0
-    }
-}
-
-impl<const N: usize> Directional for DualSVec64<N> {
-    const WIDTH: usize = N;
-    fn with_slopes(value: f64, slopes: impl Fn(usize) -> f64) -> Self {
-        let eps = nalgebra::SVector::<f64, N>::from_fn(|i, _| slopes(i));
-        Self::new(value, num_dual::Derivative::some(eps))
-    }
-    fn slope(&self, direction: usize) -> f64 {
-        self.eps.0.as_ref().map_or(0.0, |eps| eps[direction])
-    }
-}
 
 /// The model of one window.
 #[derive(Clone, Debug)]
@@ -82,6 +51,7 @@ pub struct WindowModel<'a> {
 /// Gain and whitening of one observation.
 #[derive(Clone, Debug)]
 pub struct Gain {
+    /// K, of (q, q̇) by innovation.
     gain: DMatrix<f64>,
     /// L with S = L Lᵀ.
     deviation: DMatrix<f64>,
@@ -107,157 +77,208 @@ impl Innovations {
     }
 }
 
+/// Directions that one simulation of a single joint carries derivatives along.
+const CHUNK: usize = 6;
+/// Step of finite differences where several joints move. Dual numbers through a chain of three cost
+/// 60 ms a window in copies, one more simulation .3 ms; away from switches the two agree to 1e-5.
+const DIFFERENCE: f64 = 1e-6;
+
+/// A tree with derivatives along some of the directions: first parameters, then q, then q̇.
+struct Chunk {
+    tree: Tree<DualSVec64<CHUNK>>,
+    first: usize,
+}
+
+/// How the derivatives of a span are taken.
+enum Slopes {
+    Forward(Vec<Chunk>),
+    /// The tree, and one for each parameter moved by [`DIFFERENCE`].
+    Differences(Tree<f64>, Vec<Tree<f64>>),
+}
+
 impl WindowModel<'_> {
     /// Innovations, their derivatives by the `active` entries of `x`, and the gains, at `x`.
     pub fn linearize(&self, x: &[f64], active: &[usize]) -> Result<Innovations, Failure> {
-        match active.len() + 2 * self.moving.len() {
-            0..=2 => self.pass::<DualSVec64<2>>(x, active, None),
-            3..=4 => self.pass::<DualSVec64<4>>(x, active, None),
-            5 => self.pass::<DualSVec64<5>>(x, active, None),
-            6..=7 => self.pass::<DualSVec64<7>>(x, active, None),
-            8..=10 => self.pass::<DualSVec64<10>>(x, active, None),
-            11..=16 => self.pass::<DualSVec64<16>>(x, active, None),
-            17..=24 => self.pass::<DualSVec64<24>>(x, active, None),
-            25..=32 => self.pass::<DualSVec64<32>>(x, active, None),
-            _ => self.pass::<DualSVec64<48>>(x, active, None),
-        }
-    }
-
-    /// Whitened innovations at `x` with gains from elsewhere.
-    pub fn residuals(&self, x: &[f64], gains: &[Gain]) -> Result<Vec<f64>, Failure> {
-        self.pass::<f64>(x, &[], Some(gains)).map(|i| i.whitened)
-    }
-
-    fn pass<T: Directional>(&self, x: &[f64], active: &[usize], gains: Option<&[Gain]>) -> Result<Innovations, Failure> {
         let n = self.moving.len();
         let p = active.len();
-        if self.track.observations.len() < 3 {
+        let slopes_by = if n > 1 { self.differences(x, active)? } else { self.forward(x, active)? };
+        let noise = ProcessNoise::new(self, x)?;
+        let observations = &self.track.observations;
+        if observations.len() < 3 {
             return Err(Failure::NoInformation);
         }
-        if gains.is_none() && T::WIDTH < p + 2 * n {
-            return Err(Failure::NoInformation);
-        }
-        let mut parameters: Vec<T> = x.iter().map(|&v| T::constant(v)).collect();
-        for (i, &at) in active.iter().enumerate() {
-            parameters[at] = T::with_slopes(x[at], |k| if k == i { 1.0 } else { 0.0 });
-        }
-        let tree = self.mechanism.tree(&parameters, self.axes, self.frozen)?;
-        let noise = gains.is_none().then(|| ProcessNoise::new(self, x)).transpose()?;
-        let mut state = State::<T>::at_rest(self.mechanism.joints.len());
-        let (positions, rates) = self.first_state();
-        for (i, &joint) in self.moving.iter().enumerate() {
-            state.positions[joint] = T::constant(positions[i]);
-            state.rates[joint] = T::constant(rates[i]);
-        }
+        let mut state = self.first_state();
+        let mut slopes = DMatrix::zeros(2 * n, p);
         let mut covariance = DMatrix::from_fn(2 * n, 2 * n, |i, j| match (i == j, i < n) {
             (false, _) => 0.0,
             (true, true) => FIRST_POSITION.powi(2),
             (true, false) => FIRST_RATE.powi(2),
         });
         let mut result = Innovations::default();
-        let observations = &self.track.observations;
         for (k, observation) in observations.iter().enumerate() {
             if k > 0 {
                 let span = [observations[k - 1].time_s, observation.time_s];
-                if gains.is_none() {
-                    for (i, &joint) in self.moving.iter().enumerate() {
-                        seed(&mut state.positions[joint], p, p + i);
-                        seed(&mut state.rates[joint], p, p + n + i);
-                    }
-                }
-                state = self.advance(&tree, &state, span)?;
-                if let Some(noise) = &noise {
-                    let of = |i: usize| {
-                        let joint = self.moving[i % n];
-                        if i < n { state.positions[joint] } else { state.rates[joint] }
-                    };
-                    let transition = DMatrix::from_fn(2 * n, 2 * n, |i, j| of(i).slope(p + j));
-                    covariance = &transition * covariance * transition.transpose();
-                    let q: Vec<f64> = state.positions.iter().map(|q| q.value()).collect();
-                    covariance += noise.over(span, &q, self)?;
-                }
+                let (next, derivatives) = self.advance_with_slopes(&slopes_by, &state, span, p)?;
+                state = next;
+                let transition = derivatives.columns(p, 2 * n);
+                slopes = transition * slopes + derivatives.columns(0, p);
+                covariance = transition * covariance * transition.transpose();
+                covariance += noise.over(span, &self.all_positions(&state), self)?;
             }
-            let innovation: Vec<T> = (0..n)
-                .map(|row| {
-                    self.moving.iter().enumerate().fold(T::constant(observation.value[row]), |sum, (i, &joint)| {
-                        sum - state.positions[joint] * T::constant(observation.rows[(row, i)])
-                    })
-                })
-                .collect();
-            let fresh;
-            let gain = match gains {
-                Some(gains) => &gains[k],
-                None => {
-                    let spread = covariance.columns(0, n) * observation.rows.transpose();
-                    let total = &observation.rows * spread.rows(0, n) + DMatrix::identity(n, n);
-                    let cholesky = total.cholesky().ok_or(Failure::Diverged)?;
-                    let gain = cholesky.solve(&spread.transpose()).transpose();
-                    covariance -= &gain * spread.transpose();
-                    covariance = (&covariance + covariance.transpose()) * 0.5;
-                    fresh = Gain { gain, deviation: cholesky.unpack() };
-                    &fresh
-                }
-            };
-            let lower = &gain.deviation;
-            let mut whitened: Vec<T> = Vec::with_capacity(n);
+            let innovation = &observation.value - &observation.rows * state.rows(0, n);
+            let innovation_slopes = -(&observation.rows * slopes.rows(0, n));
+            let spread = covariance.columns(0, n) * observation.rows.transpose();
+            let total = &observation.rows * spread.rows(0, n) + DMatrix::identity(n, n);
+            let cholesky = total.cholesky().ok_or(Failure::Diverged)?;
+            let gain = cholesky.solve(&spread.transpose()).transpose();
+            covariance -= &gain * spread.transpose();
+            covariance = (&covariance + covariance.transpose()) * 0.5;
+            let deviation = cholesky.unpack();
+            let whitened = deviation.solve_lower_triangular(&innovation).ok_or(Failure::Diverged)?;
+            let whitened_slopes = deviation.solve_lower_triangular(&innovation_slopes).ok_or(Failure::Diverged)?;
+            result.half_log_determinant += deviation.diagonal().iter().map(|d| d.ln()).sum::<f64>();
+            result.whitened.extend(whitened.iter());
             for row in 0..n {
-                let sum = (0..row).fold(innovation[row], |sum, j| sum - whitened[j] * T::constant(lower[(row, j)]));
-                whitened.push(sum * T::constant(1.0 / lower[(row, row)]));
-                result.half_log_determinant += lower[(row, row)].ln();
+                result.slopes.extend(whitened_slopes.row(row).iter());
             }
-            for e in &whitened {
-                result.whitened.push(e.value());
-                result.slopes.extend((0..p).map(|i| e.slope(i)));
-            }
-            for (i, &joint) in self.moving.iter().enumerate() {
-                for (row, e) in innovation.iter().enumerate() {
-                    state.positions[joint] += *e * T::constant(gain.gain[(i, row)]);
-                    state.rates[joint] += *e * T::constant(gain.gain[(n + i, row)]);
-                }
-            }
-            if gains.is_none() {
-                result.gains.push(gain.clone());
-            }
+            state += &gain * innovation;
+            slopes += &gain * innovation_slopes;
+            result.gains.push(Gain { gain, deviation });
         }
         if result.whitened.iter().chain(&result.slopes).all(|e| e.is_finite()) { Ok(result) } else { Err(Failure::Diverged) }
     }
 
-    fn advance<T: Real>(&self, tree: &crate::mechanism::Tree<T>, state: &State<T>, span: [f64; 2]) -> Result<State<T>, Failure> {
-        let samples = within(&self.track.samples, span);
-        let track = self.track.touched.map(|body| WrenchTrack::new(body, samples));
-        let tracks = track.as_slice();
-        let start = State::new(state.positions.clone(), state.rates.clone());
-        let run = rollout(tree, &start, tracks, &span, if self.moving.len() > 1 { CHAIN_STEP_S } else { STEP_S }).map_err(|_| Failure::Diverged)?;
-        Ok(State::new(run.positions(1).to_vec(), run.rates(1).to_vec()))
+    /// Whitened innovations at `x` with gains from elsewhere.
+    pub fn residuals(&self, x: &[f64], gains: &[Gain]) -> Result<Vec<f64>, Failure> {
+        let n = self.moving.len();
+        let tree = self.mechanism.tree(x, self.axes, self.frozen)?;
+        let mut state = self.first_state();
+        let mut all = Vec::with_capacity(n * gains.len());
+        for (k, (observation, Gain { gain, deviation })) in self.track.observations.iter().zip(gains).enumerate() {
+            if k > 0 {
+                let span = [self.track.observations[k - 1].time_s, observation.time_s];
+                let run = self.advance(&tree, state.as_slice(), span)?;
+                state = DVector::from_vec(run);
+            }
+            let innovation = &observation.value - &observation.rows * state.rows(0, n);
+            let whitened = deviation.solve_lower_triangular(&innovation).ok_or(Failure::Diverged)?;
+            all.extend(whitened.iter());
+            state += gain * innovation;
+        }
+        if all.iter().all(|e: &f64| e.is_finite()) { Ok(all) } else { Err(Failure::Diverged) }
     }
 
-    /// Positions at the first observation, and rates if the window opens in motion.
-    fn first_state(&self) -> (Vec<f64>, Vec<f64>) {
+    fn forward(&self, x: &[f64], active: &[usize]) -> Result<Slopes, Failure> {
+        let directions = active.len() + 2 * self.moving.len();
+        let chunks = (0..directions).step_by(CHUNK).map(|first| {
+            let mut parameters: Vec<DualSVec64<CHUNK>> = x.iter().map(|&v| Real::constant(v)).collect();
+            for (i, &at) in active.iter().enumerate() {
+                if (first..first + CHUNK).contains(&i) {
+                    parameters[at] = parameters[at].derivative(i - first);
+                }
+            }
+            Ok(Chunk { tree: self.mechanism.tree(&parameters, self.axes, self.frozen)?, first })
+        });
+        Ok(Slopes::Forward(chunks.collect::<Result<_, Failure>>()?))
+    }
+
+    fn differences(&self, x: &[f64], active: &[usize]) -> Result<Slopes, Failure> {
+        let moved = active.iter().map(|&at| {
+            let mut moved = x.to_vec();
+            moved[at] += DIFFERENCE;
+            self.mechanism.tree(&moved, self.axes, self.frozen)
+        });
+        let moved = moved.collect::<Result<_, Failure>>()?;
+        Ok(Slopes::Differences(self.mechanism.tree(x, self.axes, self.frozen)?, moved))
+    }
+
+    /// The state after a span, and its derivatives by parameters and by the state before.
+    fn advance_with_slopes(&self, slopes: &Slopes, state: &DVector<f64>, span: [f64; 2], p: usize) -> Result<(DVector<f64>, DMatrix<f64>), Failure> {
+        let chunks = match slopes {
+            Slopes::Forward(chunks) => chunks,
+            Slopes::Differences(tree, moved) => {
+                let after = DVector::from_vec(self.advance(tree, state.as_slice(), span)?);
+                let mut derivatives = DMatrix::zeros(state.len(), p + state.len());
+                for column in 0..p + state.len() {
+                    let mut start = state.clone();
+                    let tree = match column.checked_sub(p) {
+                        Some(i) => {
+                            start[i] += DIFFERENCE;
+                            tree
+                        }
+                        None => &moved[column],
+                    };
+                    let end = DVector::from_vec(self.advance(tree, start.as_slice(), span)?);
+                    derivatives.set_column(column, &((end - &after) / DIFFERENCE));
+                }
+                return Ok((after, derivatives));
+            }
+        };
+        let size = state.len();
+        let mut after = DVector::zeros(size);
+        let mut derivatives = DMatrix::zeros(size, p + size);
+        for chunk in chunks {
+            let start: Vec<DualSVec64<CHUNK>> = (0..size)
+                .map(|i| {
+                    let value: DualSVec64<CHUNK> = Real::constant(state[i]);
+                    match (p + i).checked_sub(chunk.first) {
+                        Some(direction) if direction < CHUNK => value.derivative(direction),
+                        _ => value,
+                    }
+                })
+                .collect();
+            for (i, value) in self.advance(&chunk.tree, &start, span)?.iter().enumerate() {
+                after[i] = value.re;
+                if let Some(eps) = &value.eps.0 {
+                    for direction in 0..CHUNK.min(p + size - chunk.first) {
+                        derivatives[(i, chunk.first + direction)] = eps[direction];
+                    }
+                }
+            }
+        }
+        Ok((after, derivatives))
+    }
+
+    /// (q, q̇) of the moving joints after a span.
+    fn advance<T: Real>(&self, tree: &Tree<T>, state: &[T], span: [f64; 2]) -> Result<Vec<T>, Failure> {
+        let n = self.moving.len();
+        let mut positions = vec![T::zero(); self.mechanism.joints.len()];
+        let mut rates = positions.clone();
+        for (i, &joint) in self.moving.iter().enumerate() {
+            positions[joint] = state[i];
+            rates[joint] = state[n + i];
+        }
+        let samples = within(&self.track.samples, span);
+        let track = self.track.touched.map(|body| WrenchTrack::new(body, samples));
+        let step_s = if n > 1 { CHAIN_STEP_S } else { STEP_S };
+        let run = rollout(tree, &State::new(positions, rates), track.as_slice(), &span, step_s).map_err(|_| Failure::Diverged)?;
+        let (positions, rates) = (run.positions(1), run.rates(1));
+        Ok(self.moving.iter().map(|&j| positions[j]).chain(self.moving.iter().map(|&j| rates[j])).collect())
+    }
+
+    fn all_positions(&self, state: &DVector<f64>) -> Vec<f64> {
+        let mut positions = vec![0.0; self.mechanism.joints.len()];
+        for (i, &joint) in self.moving.iter().enumerate() {
+            positions[joint] = state[i];
+        }
+        positions
+    }
+
+    /// (q, q̇) at the first observation, with rates if the window opens in motion.
+    fn first_state(&self) -> DVector<f64> {
         let n = self.moving.len();
         let first = &self.track.positions[0];
         let ahead = 3.min(self.track.positions.len() - 1);
         let span_s = self.track.observations[ahead].time_s - self.track.observations[0].time_s;
-        let rates = (0..n).map(|i| {
-            let step = self.track.positions[ahead][i] - first[i];
+        DVector::from_fn(2 * n, |i, _| {
+            if i < n {
+                return first[i];
+            }
+            let step = self.track.positions[ahead][i - n] - first[i - n];
             // Positions of a joint at rest are equal, as the kinematic fit ties them.
             if step.abs() > 0.02 && span_s > 0.0 { step / span_s } else { 0.0 }
-        });
-        (first.iter().copied().collect(), rates.collect())
+        })
     }
-}
-
-/// Leaves the derivatives along the first `keep` directions, and marks one more.
-fn seed<T: Directional>(x: &mut T, keep: usize, mark: usize) {
-    let old = *x;
-    *x = T::with_slopes(old.value(), |i| {
-        if i < keep {
-            old.slope(i)
-        } else if i == mark {
-            1.0
-        } else {
-            0.0
-        }
-    });
 }
 
 /// The samples needed between two times.
@@ -269,7 +290,7 @@ fn within(samples: &[WrenchSample], span: [f64; 2]) -> &[WrenchSample] {
 
 /// White generalized force: what the wrench sensor's noise and the unevenness of friction do.
 struct ProcessNoise {
-    tree: crate::mechanism::Tree<f64>,
+    tree: Tree<f64>,
     /// Density of the friction's unevenness per moving joint \[N² s or (N·m)² s\].
     floor: Vec<f64>,
 }

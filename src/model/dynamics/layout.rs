@@ -2,7 +2,9 @@
 //!
 //! Inertial numbers are those that a joint's own motion shows (base parameters, Khalil & Dombre,
 //! "Modeling, Identification and Control of Robots", 2002, chapter 9): a body's inertia about its
-//! own joint, its first moment across the axis, and its mass where an ancestor carries it.
+//! own joint, and where gravity or an ancestor shows them its mass and its centre of mass across the
+//! axis. The first moment itself would be linear in the equations, but its prior is not Gaussian:
+//! a mass within a factor of three times a centre within a few centimetres.
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 
@@ -25,8 +27,9 @@ pub const LOWER: usize = 3;
 pub const UPPER: usize = 4;
 /// ln mass \[kg\] of a body on a hinge.
 pub const MASS: usize = 5;
-/// First of two components of the first moment across the axis \[kg·m\].
-pub const MOMENT: usize = 6;
+/// First of two components of the centre of mass across the axis \[m\]: from the axis of a hinge,
+/// from the hull's centre on a slide.
+pub const CENTER: usize = 6;
 /// Numbers of a joint without effects; those of its effects follow.
 pub const SIZE: usize = 8;
 
@@ -66,10 +69,10 @@ pub struct JointModel {
     pub stops: [bool; 2],
     /// Whether a moving ancestor carries it.
     pub carried: bool,
-    /// Whether its first moment shows: on a hinge that gravity loads, or that is carried.
-    pub moment_shows: bool,
-    /// The two directions of the first moment.
-    pub moment_basis: [Vector3<f64>; 2],
+    /// Whether its centre of mass shows: on a hinge that gravity loads, or that is carried.
+    pub center_shows: bool,
+    /// The two directions of the centre of mass.
+    pub center_basis: [Vector3<f64>; 2],
     /// Effects beyond the declared model, whose numbers follow the declared ones.
     pub effects: Vec<EffectKind>,
 }
@@ -84,11 +87,11 @@ impl JointModel {
     pub fn active(&self) -> Vec<usize> {
         let mut active = vec![DAMPING, FRICTION, INERTIA];
         active.extend([LOWER, UPPER].into_iter().zip(self.stops).filter(|(_, there)| *there).map(|(i, _)| i));
-        if self.carried && self.joint.joint_type == JointType::Revolute {
+        if self.center_shows && self.joint.joint_type == JointType::Revolute {
             active.push(MASS);
         }
-        if self.moment_shows {
-            active.extend([MOMENT, MOMENT + 1]);
+        if self.center_shows {
+            active.extend([CENTER, CENTER + 1]);
         }
         active.extend(SIZE..self.size());
         active
@@ -139,12 +142,11 @@ impl JointModel {
             map[(place, place)] = if self.stops[i] { LIMIT_DEVIATION } else { 1.0 };
         }
         let offset = self.hull.center - self.foot(&self.joint.axis);
-        for (i, basis) in self.moment_basis.iter().enumerate() {
-            let moment = mass * offset.dot(basis);
+        for (i, basis) in self.center_basis.iter().enumerate() {
+            let revolute = self.joint.joint_type == JointType::Revolute;
+            mean[CENTER + i] = if revolute { offset.dot(basis) } else { 0.0 };
             let spread = self.hull.spread.dot(&basis.abs()).max(0.01);
-            mean[MOMENT + i] = moment;
-            map[(MOMENT + i, MOMENT + i)] = (0.36 * moment * moment + (mass * CENTER_DEVIATION * spread).powi(2)).sqrt();
-            map[(MOMENT + i, MASS)] = 0.8 * moment;
+            map[(CENTER + i, CENTER + i)] = CENTER_DEVIATION * spread;
         }
         Gaussian::from_moments(&mean, &(&map * map.transpose()))
     }
@@ -152,20 +154,20 @@ impl JointModel {
     /// The body's inertial properties at the reference configuration from the joint's numbers.
     fn inertia<T: Real>(&self, x: &[T], axis: &Axis) -> (T, Vector3<T>, Matrix3<T>) {
         let shape = self.shape();
-        let moment = self.moment_basis[0].map(T::constant) * x[MOMENT] + self.moment_basis[1].map(T::constant) * x[MOMENT + 1];
+        let arm = self.center_basis[0].map(T::constant) * x[CENTER] + self.center_basis[1].map(T::constant) * x[CENTER + 1];
         match self.joint.joint_type {
             JointType::Revolute => {
                 let mass = x[MASS].exp();
                 let n = axis.direction;
-                let com = self.foot(axis).map(T::constant) + moment / mass;
+                let com = self.foot(axis).map(T::constant) + arm;
                 let along = T::constant(n.dot(&(shape * n)));
-                let about_axis = x[INERTIA].exp() - moment.norm_squared() / mass - mass * along;
+                let about_axis = x[INERTIA].exp() - (arm.norm_squared() + along) * mass;
                 let about_com = shape.map(T::constant) * mass + (n * n.transpose()).map(T::constant) * about_axis;
                 (mass, com, about_com)
             }
             _ => {
                 let mass = x[INERTIA].exp();
-                (mass, self.hull.center.map(T::constant) + moment / mass, shape.map(T::constant) * mass)
+                (mass, self.hull.center.map(T::constant) + arm, shape.map(T::constant) * mass)
             }
         }
     }
@@ -267,7 +269,7 @@ pub fn joint_models(
             let revolute = joint.joint_type == JointType::Revolute;
             // A hinge within .5° of gravity is loaded by less than a hundredth of the weight.
             let loaded = revolute && joint.axis.direction.cross(gravity).norm() > 0.01 * gravity.norm();
-            let (moment_shows, across) = if revolute {
+            let (center_shows, across) = if revolute {
                 (loaded || carried, joint.axis.direction)
             } else {
                 (hinge_above(k).is_some(), hinge_above(k).unwrap_or(joint.axis.direction))
@@ -279,8 +281,8 @@ pub fn joint_models(
                 scales: scales[k],
                 stops: stops[k],
                 carried,
-                moment_shows,
-                moment_basis: [first, second],
+                center_shows,
+                center_basis: [first, second],
                 effects: Vec::new(),
             }
         })

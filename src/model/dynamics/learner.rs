@@ -60,7 +60,7 @@ struct JointMemory {
     stops: [bool; 2],
     /// Where the stops are expected, once they are believed.
     stop_positions: [f64; 2],
-    moment_basis: Option<[Vector3<f64>; 2]>,
+    center_basis: Option<[Vector3<f64>; 2]>,
     hull: Option<HullProperties>,
 }
 
@@ -156,7 +156,7 @@ impl DynamicsLearner {
                     scales: None,
                     stops: [false; 2],
                     stop_positions: [0.0; 2],
-                    moment_basis: None,
+                    center_basis: None,
                     hull,
                 };
                 self.joints.insert(joint.child, memory);
@@ -198,7 +198,7 @@ impl DynamicsLearner {
         for model in &mut models {
             let label = model.joint.child;
             let Some(memory) = self.joints.get_mut(&label) else { continue };
-            model.moment_basis = *memory.moment_basis.get_or_insert(model.moment_basis);
+            model.center_basis = *memory.center_basis.get_or_insert(model.center_basis);
             let block = Block::Dynamics(label);
             // The prior is made once; a stop that comes to be believed changes its own entries only.
             let gaussian = match self.belief.prior(&block) {
@@ -356,7 +356,7 @@ impl DynamicsLearner {
         if moving.is_empty() {
             return self.learn_rest(window, fit, input);
         }
-        let mut fitted = self.fit_window(window, fit, input, &moving, &frozen, steps)?;
+        let mut fitted = self.fit_window(window, fit, input, &moving, &frozen, (steps, None))?;
         let mut spent = fitted.1.steps;
         // Stops where the joint arrived at the end of its range.
         let halts = if self.windows[window].learned { Vec::new() } else { self.halts(window, fit, &moving) };
@@ -368,7 +368,7 @@ impl DynamicsLearner {
                 memory.stop_positions[side] = position;
             }
             self.rebuild(fit)?;
-            let trial = self.fit_window(window, fit, input, &moving, &frozen, steps);
+            let trial = self.fit_window(window, fit, input, &moving, &frozen, (6, Some(&fitted.1)));
             spent += trial.as_ref().map_or(0, |t| t.1.steps);
             match trial {
                 Ok(trial) if trial.1.log_predictive > fitted.1.log_predictive + STOP_EVIDENCE => fitted = trial,
@@ -449,7 +449,7 @@ impl DynamicsLearner {
         input: &DynamicsInput<'_>,
         moving: &[usize],
         frozen: &[Option<f64>],
-        steps: usize,
+        (steps, warm): (usize, Option<&FittedWindow>),
     ) -> Result<(Factor<Block>, FittedWindow), Failure> {
         let source = self.source(window, moving, fit, input);
         let kinematics = kinematics_of(fit);
@@ -467,7 +467,13 @@ impl DynamicsLearner {
         let (mean, _) = conditional.moments()?;
         let prior = conditional.marginal(&active)?;
         let (start, covariance) = prior.moments()?;
-        let starts = starts(&start, &covariance, &active, &self.mechanism, moving);
+        let starts = match warm {
+            Some(warm) => vec![DVector::from_fn(active.len(), |i, _| {
+                warm.active.iter().position(|a| *a == active[i]).map_or(start[i], |k| warm.solution.point[k])
+            })],
+            None => starts(&start, &covariance, &active, &self.mechanism, moving),
+        };
+        let noise_scale = warm.map(|w| w.noise_scale).or(self.windows[window].noise_scale);
         let window_fit = WindowFit {
             mechanism: &self.mechanism,
             source,
@@ -477,7 +483,7 @@ impl DynamicsLearner {
             active,
             base: mean.iter().copied().collect(),
         };
-        let fitted = window_fit.fit(&prior, &starts, self.windows[window].noise_scale, steps)?;
+        let fitted = window_fit.fit(&prior, &starts, noise_scale, steps)?;
         let deviations = self.deviations(fit, &involved, input.use_tool || !self.windows[window].contacts.is_empty());
         let sensitivity = window_fit.sensitivity(&fitted, &deviations);
         Ok((self.factor(fit, &window_fit, &fitted, &sensitivity), fitted))

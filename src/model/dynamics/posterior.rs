@@ -2,7 +2,7 @@
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 
-use super::layout::{DAMPING, FRICTION, INERTIA, LOWER, MASS, MOMENT, UPPER};
+use super::layout::{DAMPING, FRICTION, INERTIA, LOWER, MASS, CENTER, UPPER};
 use super::learner::{Block, DynamicsLearner};
 use crate::inference::Failure;
 use crate::mechanism::JointType;
@@ -100,7 +100,7 @@ impl DynamicsLearner {
             let com = |x: &DVector<f64>| self.mechanism.center_of_mass(k, x.as_slice());
             let center = com(&posterior.mean);
             let mut com_covariance = Matrix3::zeros();
-            let entries = [MASS, INERTIA, MOMENT, MOMENT + 1];
+            let entries = [MASS, INERTIA, CENTER, CENTER + 1];
             let slopes = entries.map(|entry| {
                 let mut moved = posterior.mean.clone();
                 moved[at + entry] += 1e-5;

@@ -44,7 +44,9 @@ pub struct WindowFit<'a> {
 /// A fitted window.
 #[derive(Clone, Debug)]
 pub struct FittedWindow {
-    /// The optimum of the active entries.
+    /// The entries of the full parameter vector that were fitted.
+    pub active: Vec<usize>,
+    /// The optimum of them.
     pub solution: Solution,
     /// κ.
     pub noise_scale: f64,
@@ -144,6 +146,7 @@ impl WindowFit<'_> {
             }
             let innovations = problem.latest;
             return Ok(FittedWindow {
+                active: self.active.clone(),
                 reduction: reduction(&innovations.whitened, self.source.moving.len()),
                 noise_scale: scale,
                 log_predictive: solution.log_evidence - innovations.half_log_determinant - scale_cost(scale),
@@ -275,8 +278,8 @@ fn reduction(whitened: &[f64], rows: usize) -> f64 {
 
 /// Entries of one joint's numbers among `active`, that only inertia needs.
 pub fn inertial_entries(active: &[usize]) -> Vec<usize> {
-    use super::layout::{INERTIA, MASS, MOMENT};
-    active.iter().copied().filter(|i| [INERTIA, MASS, MOMENT, MOMENT + 1].contains(i)).collect()
+    use super::layout::{INERTIA, MASS, CENTER};
+    active.iter().copied().filter(|i| [INERTIA, MASS, CENTER, CENTER + 1].contains(i)).collect()
 }
 
 /// −ln P(F > load) with the load known to [`LOAD_DEVIATION`], logistic for the normal of that slope.
