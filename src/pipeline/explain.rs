@@ -13,7 +13,7 @@ use crate::math::{Pose, Screw};
 use crate::mechanism::JointType;
 use crate::model::{Axis, Contact, KinematicJoint, KinematicSettings, PoseMeasurement, WindowObservations, fit_kinematics};
 use crate::registration::{
-    AlignmentSettings, AxisSeed, JointFrame, JointPath, PartModel, Quadratic, ScanPoint, fit_circle, fit_line,
+    AlignmentSettings, AxisSeed, JointFrame, JointPath, OUTLIER_COST, PartModel, Quadratic, ScanPoint, fit_circle, fit_line,
     geometric_seeds, pose_factor, search_path, truncated_cost,
 };
 use crate::types::Label;
@@ -38,6 +38,15 @@ pub struct Frame {
     pub scans: BTreeMap<Label, Vec<ScanPoint>>,
 }
 
+/// What a part's scans cost where its pose is known.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Baseline {
+    /// Mean truncated cost per point.
+    pub cost: f64,
+    /// Mean number of points in a scan.
+    pub points: f64,
+}
+
 /// What a window's motion is explained with.
 pub struct Scene<'a> {
     /// The window's frames.
@@ -46,8 +55,8 @@ pub struct Scene<'a> {
     pub contacts: &'a [Contact],
     /// Reference models; the root has none that matters.
     pub models: &'a BTreeMap<Label, PartModel>,
-    /// Mean truncated cost per point of each part at a known pose.
-    pub baselines: &'a BTreeMap<Label, f64>,
+    /// What each part costs at a known pose.
+    pub baselines: &'a BTreeMap<Label, Baseline>,
     /// Displacements before the window.
     pub start: &'a BTreeMap<Label, Pose>,
     /// Joints known so far, parents first.
@@ -120,11 +129,20 @@ impl Scene<'_> {
     fn evaluate(&self, label: Label, displacement: impl Fn(usize) -> Pose) -> Motion {
         let displacements: Vec<Pose> = (0..self.frames.len()).map(displacement).collect();
         let model = &self.models[&label];
+        let baseline = self.baselines.get(&label).copied().unwrap_or_default();
         let costs: Vec<f64> = displacements
             .iter()
             .enumerate()
             .filter(|(k, _)| !self.scan(label, *k).is_empty())
-            .map(|(k, d)| truncated_cost(model, self.scan(label, k), self.scan(label, k).len() / 150, d))
+            .map(|(k, d)| {
+                let scan = self.scan(label, k);
+                let cost = truncated_cost(model, scan, scan.len() / 150, d);
+                // Per point, what is turned away from the sensor does not count; per scan, new faces
+                // do not. Either may happen, so the smaller excess is taken.
+                let per_point = cost - baseline.cost;
+                let matched = (OUTLIER_COST - cost) * scan.len() as f64 / baseline.points.max(1.0);
+                per_point.min(OUTLIER_COST - baseline.cost - matched).max(-0.3)
+            })
             .collect();
         let mean = costs.iter().sum::<f64>() / costs.len().max(1) as f64;
         // A part that moves late in the window hides in the mean: the worst quarter counts as well.
@@ -134,8 +152,7 @@ impl Scene<'_> {
         let worst = worst.iter().sum::<f64>() / worst.len().max(1) as f64;
         let start = self.start_of(label);
         let moved = displacements.iter().any(|d| travel(model, &start, d) > 0.002);
-        let baseline = self.baselines.get(&label).copied().unwrap_or(0.0);
-        Motion { displacements, moved, excess: mean.max(0.6 * worst) - baseline, seed: None }
+        Motion { displacements, moved, excess: mean.max(0.6 * worst), seed: None }
     }
 
     /// Root mean square by which the tool misses a contact point that is fixed on the part \[m\].

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::{DMatrix, Vector3};
 
-use super::explain::{Frame, Motion, Scene, explain_window, measure_faces, travel};
+use super::explain::{Baseline, Frame, Motion, Scene, explain_window, measure_faces, travel};
 use crate::math::Pose;
 use crate::mechanism::JointType;
 use crate::geometry::{HullProperties, hull_properties};
@@ -24,6 +24,10 @@ const MOVED: f64 = 0.006;
 const RESTS: f64 = 1e-6;
 /// A face's normal suggests an axis within 15° of it.
 const SUGGESTION_COSINE: f64 = 0.966;
+/// Visible surfaces of parts that are joined are this close \[m\]; the joint itself is mostly hidden.
+const CONTACT_GAP: f64 = 0.05;
+/// Log prior lost at most by parts that are far apart \[nats\].
+const FARTHEST_PENALTY: f64 = 40.0;
 /// Scans kept from each window for growing a part's model, and in all.
 const KEYFRAMES_PER_WINDOW: usize = 10;
 const MOST_KEYFRAMES: usize = 40;
@@ -64,8 +68,10 @@ pub struct Learner {
     reference: BTreeMap<Label, Vec<Surfel>>,
     /// Scans that the models grow from, with their window and frame.
     keyframes: BTreeMap<Label, Vec<(usize, usize, Vec<ScanPoint>)>>,
-    /// Mean truncated cost per point at known poses.
-    pub baselines: BTreeMap<Label, f64>,
+    /// What scans cost at known poses.
+    pub baselines: BTreeMap<Label, Baseline>,
+    /// Distance between the surfaces of each pair of parts at the first look \[m\], smaller label first.
+    gaps: BTreeMap<(Label, Label), f64>,
     /// Displacements after the last window.
     pub displacements: BTreeMap<Label, Pose>,
     /// Every window's measurements.
@@ -90,6 +96,7 @@ impl Learner {
     /// Nothing learned yet: models from the scans accumulated at the reference configuration.
     pub fn new(root: Label, use_tool: bool, accumulators: BTreeMap<Label, SurfelAccumulator>) -> Self {
         let reference: BTreeMap<Label, Vec<Surfel>> = accumulators.iter().map(|(label, a)| (*label, a.surfels())).collect();
+        let gaps = surface_gaps(&reference);
         let models = reference.iter().filter_map(|(label, s)| Some((*label, PartModel::new(s, &[])?))).collect();
         Self {
             root,
@@ -97,6 +104,7 @@ impl Learner {
             models,
             reference,
             keyframes: BTreeMap::new(),
+            gaps,
             baselines: BTreeMap::new(),
             displacements: BTreeMap::new(),
             windows: Vec::new(),
@@ -118,15 +126,20 @@ impl Learner {
     /// Sets the baselines from frames at the reference configuration.
     pub fn calibrate(&mut self, frames: &[Frame]) {
         for (label, model) in &self.models {
-            let costs: Vec<f64> = frames
-                .iter()
-                .filter_map(|f| f.scans.get(label))
-                .filter(|scan| !scan.is_empty())
-                .map(|scan| truncated_cost(model, scan, scan.len() / 150, &Pose::identity()))
-                .collect();
-            if !costs.is_empty() {
-                self.baselines.insert(*label, costs.iter().sum::<f64>() / costs.len() as f64);
+            let scans: Vec<&Vec<ScanPoint>> =
+                frames.iter().filter_map(|f| f.scans.get(label)).filter(|scan| !scan.is_empty()).collect();
+            if scans.is_empty() {
+                continue;
             }
+            let count = scans.len() as f64;
+            let cost = |scan: &&Vec<ScanPoint>| truncated_cost(model, scan, scan.len() / 150, &Pose::identity());
+            self.baselines.insert(
+                *label,
+                Baseline {
+                    cost: scans.iter().map(cost).sum::<f64>() / count,
+                    points: scans.iter().map(|scan| scan.len() as f64).sum::<f64>() / count,
+                },
+            );
         }
     }
 
@@ -332,11 +345,26 @@ impl Learner {
             for option in options {
                 let row = option.parent.map_or(Some(0), |p| movers.iter().position(|l| *l == p).map(|i| i + 1));
                 if let Some(row) = row {
-                    weights[(row, column + 1)] = log_mean_exp(&option.log_evidence);
+                    let prior = self.log_contact_prior(movers[column], option.parent);
+                    weights[(row, column + 1)] = log_mean_exp(&option.log_evidence) + prior;
                 }
             }
         }
         weights
+    }
+
+    /// Log prior of a joint between two parts by the gap between their surfaces: what is joined
+    /// touches. `None`: the nearest of the parts that never moved.
+    fn log_contact_prior(&self, child: Label, parent: Option<Label>) -> f64 {
+        let gap = |other: Label| self.gaps.get(&(child.min(other), child.max(other))).copied().unwrap_or(0.0);
+        let gap = match parent {
+            Some(parent) => gap(parent),
+            None => {
+                let still = self.models.keys().filter(|l| **l != child && !self.evidence.contains_key(l));
+                still.map(|l| gap(*l)).fold(f64::INFINITY, f64::min)
+            }
+        };
+        -(0.5 * ((gap - CONTACT_GAP).max(0.0) / CONTACT_GAP).powi(2)).min(FARTHEST_PENALTY)
     }
 
     /// The likeliest parent and type of each mover, as a tree with parents first.
@@ -468,6 +496,20 @@ impl Learner {
             }
         }
     }
+}
+
+/// Smallest distance between the surfels of each pair of parts \[m\].
+fn surface_gaps(parts: &BTreeMap<Label, Vec<Surfel>>) -> BTreeMap<(Label, Label), f64> {
+    let mut gaps = BTreeMap::new();
+    for (first, surfels) in parts {
+        for (second, others) in parts.range((std::ops::Bound::Excluded(*first), std::ops::Bound::Unbounded)) {
+            let nearest = |s: &Surfel| others.iter().map(|o| (o.point - s.point).norm_squared()).fold(f64::INFINITY, f64::min);
+            let every = (surfels.len() / 400).max(1);
+            let gap = surfels.iter().step_by(every).map(nearest).fold(f64::INFINITY, f64::min).sqrt();
+            gaps.insert((*first, *second), gap);
+        }
+    }
+    gaps
 }
 
 fn log_mean_exp(values: &[f64]) -> f64 {
