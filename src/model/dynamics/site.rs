@@ -354,6 +354,9 @@ pub fn inertial_entries(active: &[usize]) -> Vec<usize> {
         .collect()
 }
 
+/// ln F with a greater deviation than this is not known yet.
+const UNKNOWN_FRICTION: f64 = 0.7;
+
 /// −ln P(F > load) with the load known to [`LOAD_DEVIATION`], logistic for the normal of that slope.
 fn load_cost(log_friction: f64, log_load: f64) -> f64 {
     let z = 1.702 * (log_load - log_friction) / LOAD_DEVIATION;
@@ -374,8 +377,9 @@ pub fn load_factor(log_load: f64, mean: f64, deviation: f64, size: usize) -> Gau
         second += weight * x * x;
     }
     let mut gaussian = Gaussian::flat(size);
-    // A load that friction as known could not hold was held by something else: an end stop.
-    if total > 0.02 * all {
+    // A load that friction, where it is known, could not hold was held by something else: a stop.
+    let unknown = deviation > UNKNOWN_FRICTION;
+    if total > if unknown { 1e-12 } else { 0.02 } * all {
         let matched = first / total;
         // Never nearly flat: a factor with a slope but no width would run away once the other
         // factors change.
