@@ -54,7 +54,11 @@ pub struct SolverSettings {
 
 impl Default for SolverSettings {
     fn default() -> Self {
-        Self { steps: 15, tolerance: 0.05, longest: 1.0 }
+        Self {
+            steps: 15,
+            tolerance: 0.05,
+            longest: 1.0,
+        }
     }
 }
 
@@ -82,7 +86,11 @@ pub fn solve(
     start: &DVector<f64>,
     settings: &SolverSettings,
 ) -> Result<Solution, Failure> {
-    let prior_cholesky = prior.precision.clone().cholesky().ok_or(Failure::Singular)?;
+    let prior_cholesky = prior
+        .precision
+        .clone()
+        .cholesky()
+        .ok_or(Failure::Singular)?;
     let mean = prior_cholesky.solve(&prior.information);
     let prior_cost = |x: &DVector<f64>| 0.5 * (x - &mean).dot(&(&prior.precision * (x - &mean)));
     let mut point = start.clone();
@@ -100,14 +108,19 @@ pub fn solve(
             for i in 0..damped.nrows() {
                 damped[(i, i)] *= 1.0 + damping;
             }
-            let Some(cholesky) = damped.cholesky() else { return Err(Failure::Singular) };
+            let Some(cholesky) = damped.cholesky() else {
+                return Err(Failure::Singular);
+            };
             let mut step = -cholesky.solve(&gradient);
             let longest = step.amax();
             if longest > settings.longest {
                 step *= settings.longest / longest;
             }
             let trial = &point + &step;
-            let trial_cost = problem.cost(&trial).map(|c| c + prior_cost(&trial)).unwrap_or(f64::INFINITY);
+            let trial_cost = problem
+                .cost(&trial)
+                .map(|c| c + prior_cost(&trial))
+                .unwrap_or(f64::INFINITY);
             let length = step.dot(&(&hessian * &step)).sqrt();
             if length < settings.tolerance && damping < 1.0 {
                 converged = true;
@@ -130,10 +143,20 @@ pub fn solve(
             converged = true;
         }
     }
-    let hessian = (&here.curvature + &prior.precision).cholesky().ok_or(Failure::Singular)?;
+    let hessian = (&here.curvature + &prior.precision)
+        .cholesky()
+        .ok_or(Failure::Singular)?;
     let cost = here.cost + prior_cost(&point);
-    let log_evidence = -cost - half_log_determinant(&hessian) + half_log_determinant(&prior_cholesky);
-    Ok(Solution { point, linearization: here, cost, log_evidence, steps, converged })
+    let log_evidence =
+        -cost - half_log_determinant(&hessian) + half_log_determinant(&prior_cholesky);
+    Ok(Solution {
+        point,
+        linearization: here,
+        cost,
+        log_evidence,
+        steps,
+        converged,
+    })
 }
 
 fn half_log_determinant(cholesky: &nalgebra::Cholesky<f64, nalgebra::Dyn>) -> f64 {
@@ -163,9 +186,18 @@ mod tests {
 
     #[test]
     fn finds_the_maximum_from_afar() {
-        let prior = Gaussian::from_moments(&DVector::zeros(1), &DMatrix::from_element(1, 1, 100.0)).expect("proper");
-        let solution = solve(&mut Exponential, &prior, &DVector::from_element(1, -3.0), &SolverSettings::default())
-            .expect("regular");
-        assert!(solution.converged && (solution.point[0] - 2f64.ln()).abs() < 1e-3, "{solution:?}");
+        let prior = Gaussian::from_moments(&DVector::zeros(1), &DMatrix::from_element(1, 1, 100.0))
+            .expect("proper");
+        let solution = solve(
+            &mut Exponential,
+            &prior,
+            &DVector::from_element(1, -3.0),
+            &SolverSettings::default(),
+        )
+        .expect("regular");
+        assert!(
+            solution.converged && (solution.point[0] - 2f64.ln()).abs() < 1e-3,
+            "{solution:?}"
+        );
     }
 }

@@ -10,7 +10,9 @@ use nalgebra::{DMatrix, DVector};
 use super::innovations::{Gain, Innovations, WindowModel, normal_equations};
 use super::layout::{FRICTION, Mechanism};
 use super::track::{JointTrack, TrackKinematics, TrackSource, joint_track};
-use crate::inference::{Failure, Gaussian, LeastSquares, Linearization, Solution, SolverSettings, solve};
+use crate::inference::{
+    Failure, Gaussian, LeastSquares, Linearization, Solution, SolverSettings, solve,
+};
 use crate::math::orthonormal_pair;
 use crate::model::{Axis, KinematicJoint};
 
@@ -86,7 +88,11 @@ impl LeastSquares for Problem<'_> {
         let cost = innovations.cost();
         self.gains = innovations.gains.clone();
         self.latest = innovations;
-        Ok(Linearization { cost, gradient, curvature })
+        Ok(Linearization {
+            cost,
+            gradient,
+            curvature,
+        })
     }
 
     fn cost(&mut self, x: &DVector<f64>) -> Result<f64, Failure> {
@@ -109,7 +115,13 @@ impl WindowFit<'_> {
     }
 
     /// Fits the window from the best of `starts`. κ is chosen anew unless it is given.
-    pub fn fit(&self, prior: &Gaussian, starts: &[DVector<f64>], noise_scale: Option<f64>, steps: usize) -> Result<FittedWindow, Failure> {
+    pub fn fit(
+        &self,
+        prior: &Gaussian,
+        starts: &[DVector<f64>],
+        noise_scale: Option<f64>,
+        steps: usize,
+    ) -> Result<FittedWindow, Failure> {
         let mut spent = 0;
         let mut best: Option<(f64, DVector<f64>)> = None;
         let first_scale = noise_scale.unwrap_or(NOISE_SCALES[1]);
@@ -119,8 +131,13 @@ impl WindowFit<'_> {
                 break;
             }
             let mut problem = self.problem(first_scale);
-            let settings = SolverSettings { steps: (steps / 3).max(3), ..SolverSettings::default() };
-            let Ok(solution) = solve(&mut problem, prior, start, &settings) else { continue };
+            let settings = SolverSettings {
+                steps: (steps / 3).max(3),
+                ..SolverSettings::default()
+            };
+            let Ok(solution) = solve(&mut problem, prior, start, &settings) else {
+                continue;
+            };
             spent += solution.steps;
             let evidence = solution.log_evidence - problem.latest.half_log_determinant;
             if best.as_ref().is_none_or(|(other, _)| evidence > *other) {
@@ -132,7 +149,10 @@ impl WindowFit<'_> {
         let rounds = if noise_scale.is_some() { 1 } else { 2 };
         for round in 0..rounds {
             let mut problem = self.problem(scale);
-            let settings = SolverSettings { steps, ..SolverSettings::default() };
+            let settings = SolverSettings {
+                steps,
+                ..SolverSettings::default()
+            };
             let solution = solve(&mut problem, prior, &point, &settings)?;
             spent += solution.steps;
             if round + 1 < rounds {
@@ -149,7 +169,9 @@ impl WindowFit<'_> {
                 active: self.active.clone(),
                 reduction: reduction(&innovations.whitened, self.source.moving.len()),
                 noise_scale: scale,
-                log_predictive: solution.log_evidence - innovations.half_log_determinant - scale_cost(scale),
+                log_predictive: solution.log_evidence
+                    - innovations.half_log_determinant
+                    - scale_cost(scale),
                 innovations,
                 solution,
                 steps: spent,
@@ -169,12 +191,17 @@ impl WindowFit<'_> {
         let mut density = |scale: f64| {
             tried += 1;
             let innovations = self.model(scale).linearize(&x, &[])?;
-            Ok::<_, Failure>(-innovations.cost() - innovations.half_log_determinant - scale_cost(scale))
+            Ok::<_, Failure>(
+                -innovations.cost() - innovations.half_log_determinant - scale_cost(scale),
+            )
         };
         let mut at = NOISE_SCALES.iter().position(|s| *s >= from).unwrap_or(0);
         let mut best = density(NOISE_SCALES[at])?;
         for direction in [1, -1_isize] {
-            while let Some(next) = at.checked_add_signed(direction).filter(|i| *i < NOISE_SCALES.len()) {
+            while let Some(next) = at
+                .checked_add_signed(direction)
+                .filter(|i| *i < NOISE_SCALES.len())
+            {
                 let trial = density(NOISE_SCALES[next])?;
                 if trial <= best {
                     break;
@@ -204,7 +231,11 @@ impl WindowFit<'_> {
         for (&at, value) in self.active.iter().zip(fitted.solution.point.iter()) {
             x[at] = *value;
         }
-        let jacobian = DMatrix::from_row_slice(fitted.innovations.whitened.len(), p, &fitted.innovations.slopes);
+        let jacobian = DMatrix::from_row_slice(
+            fitted.innovations.whitened.len(),
+            p,
+            &fitted.innovations.slopes,
+        );
         let mut hessian = jacobian.transpose() * &jacobian;
         let ridge = 1e-9 * hessian.diagonal().max() + 1e-12;
         for i in 0..p {
@@ -213,19 +244,32 @@ impl WindowFit<'_> {
         let cholesky = hessian.cholesky();
         let columns = deviations.len();
         let mut result = DMatrix::zeros(p, columns);
-        let Some(cholesky) = cholesky else { return result };
+        let Some(cholesky) = cholesky else {
+            return result;
+        };
         for (column, deviation) in deviations.iter().enumerate().filter(|(_, d)| **d > 0.0) {
             let step = 0.5 * deviation;
             let kinematics = self.moved(column, step);
-            let Some(track) = joint_track(&self.source, &kinematics) else { continue };
-            let model = WindowModel { axes: &kinematics.axes, track: &track, ..self.model(fitted.noise_scale) };
-            let Ok(residuals) = model.residuals(&x, &fitted.innovations.gains) else { continue };
+            let Some(track) = joint_track(&self.source, &kinematics) else {
+                continue;
+            };
+            let model = WindowModel {
+                axes: &kinematics.axes,
+                track: &track,
+                ..self.model(fitted.noise_scale)
+            };
+            let Ok(residuals) = model.residuals(&x, &fitted.innovations.gains) else {
+                continue;
+            };
             if residuals.len() != fitted.innovations.whitened.len() {
                 continue;
             }
             let slope = DVector::from_iterator(
                 residuals.len(),
-                residuals.iter().zip(&fitted.innovations.whitened).map(|(a, b)| (a - b) / step),
+                residuals
+                    .iter()
+                    .zip(&fitted.innovations.whitened)
+                    .map(|(a, b)| (a - b) / step),
             );
             result.set_column(column, &cholesky.solve(&(jacobian.transpose() * slope)));
         }
@@ -239,7 +283,14 @@ impl WindowFit<'_> {
         for (k, joint) in self.source.joints.iter().enumerate() {
             let count = joint.axis_parameters();
             if at < count {
-                moved.axes[k] = retracted(&KinematicJoint { axis: moved.axes[k], ..*joint }, at, step);
+                moved.axes[k] = retracted(
+                    &KinematicJoint {
+                        axis: moved.axes[k],
+                        ..*joint
+                    },
+                    at,
+                    step,
+                );
                 return moved;
             }
             at -= count;
@@ -253,11 +304,21 @@ impl WindowFit<'_> {
 fn retracted(joint: &KinematicJoint, which: usize, step: f64) -> Axis {
     let Axis { direction, point } = joint.axis;
     let (first, second) = orthonormal_pair(&direction);
-    let along = if which.is_multiple_of(2) { first } else { second };
-    if which < 2 {
-        Axis { direction: (direction + (along * step).cross(&direction)).normalize(), point }
+    let along = if which.is_multiple_of(2) {
+        first
     } else {
-        Axis { direction, point: point + along * step }
+        second
+    };
+    if which < 2 {
+        Axis {
+            direction: (direction + (along * step).cross(&direction)).normalize(),
+            point,
+        }
+    } else {
+        Axis {
+            direction,
+            point: point + along * step,
+        }
     }
 }
 
@@ -271,16 +332,30 @@ fn reduction(whitened: &[f64], rows: usize) -> f64 {
     let squares: f64 = whitened.iter().map(|e| e * e).sum();
     let variance = ((squares + VARIANCE_PRIOR) / (n + VARIANCE_PRIOR)).max(1.0);
     let correlation: f64 = (1..=6)
-        .map(|lag| whitened.iter().zip(whitened.iter().skip(lag * rows)).map(|(a, b)| a * b).sum::<f64>() / squares.max(1e-12))
+        .map(|lag| {
+            whitened
+                .iter()
+                .zip(whitened.iter().skip(lag * rows))
+                .map(|(a, b)| a * b)
+                .sum::<f64>()
+                / squares.max(1e-12)
+        })
         .sum();
     variance * (1.0 + 2.0 * correlation).clamp(1.0, 20.0)
 }
 
 /// Entries of one joint's numbers among `active`, that only inertia needs.
 pub fn inertial_entries(active: &[usize]) -> Vec<usize> {
-    use super::layout::{INERTIA, MASS, CENTER};
-    active.iter().copied().filter(|i| [INERTIA, MASS, CENTER, CENTER + 1].contains(i)).collect()
+    use super::layout::{CENTER, INERTIA, MASS};
+    active
+        .iter()
+        .copied()
+        .filter(|i| [INERTIA, MASS, CENTER, CENTER + 1].contains(i))
+        .collect()
 }
+
+/// ln F with a greater deviation than this is not known yet.
+const UNKNOWN_FRICTION: f64 = 0.7;
 
 /// −ln P(F > load) with the load known to [`LOAD_DEVIATION`], logistic for the normal of that slope.
 fn load_cost(log_friction: f64, log_load: f64) -> f64 {
@@ -291,23 +366,26 @@ fn load_cost(log_friction: f64, log_load: f64) -> f64 {
 /// What it says of ln F ~ N(mean, deviation²) that friction held a load: the Gaussian factor of
 /// matching moments, of a block of `size` numbers.
 pub fn load_factor(log_load: f64, mean: f64, deviation: f64, size: usize) -> Gaussian {
-    let (mut total, mut first, mut second) = (0.0, 0.0, 0.0);
+    let (mut all, mut total, mut first, mut second) = (0.0, 0.0, 0.0, 0.0);
     for i in 0..=400 {
         let x = mean + deviation * 5.0 * (f64::from(i) / 200.0 - 1.0);
-        let weight = (-0.5 * ((x - mean) / deviation).powi(2) - load_cost(x, log_load)).exp();
+        let before = (-0.5 * ((x - mean) / deviation).powi(2)).exp();
+        let weight = before * (-load_cost(x, log_load)).exp();
+        all += before;
         total += weight;
         first += weight * x;
         second += weight * x * x;
     }
     let mut gaussian = Gaussian::flat(size);
-    if total > 1e-12 {
+    // A load that friction, where it is known, could not hold was held by something else: a stop.
+    let unknown = deviation > UNKNOWN_FRICTION;
+    if total > if unknown { 1e-12 } else { 0.02 } * all {
         let matched = first / total;
-        let variance = (second / total - matched * matched).max(1e-6);
-        let precision = 1.0 / variance - 1.0 / (deviation * deviation);
-        if precision > 0.0 {
-            gaussian.precision[(FRICTION, FRICTION)] = precision;
-            gaussian.information[FRICTION] = matched / variance - mean / (deviation * deviation);
-        }
+        // Never nearly flat: a factor with a slope but no width would run away once the other
+        // factors change.
+        let variance = (second / total - matched * matched).min(0.75 * deviation * deviation);
+        gaussian.precision[(FRICTION, FRICTION)] = 1.0 / variance - 1.0 / (deviation * deviation);
+        gaussian.information[FRICTION] = matched / variance - mean / (deviation * deviation);
     }
     gaussian
 }
