@@ -19,8 +19,12 @@ use crate::math::{Pose, Screw, orthonormal_pair};
 use crate::mechanism::JointType;
 use crate::types::Label;
 
-/// Standard deviation of the pose at which later faces were added to a model \[m\].
-const FACE_ERROR_SIGMA: f64 = 0.020;
+/// Standard deviations \[m\] of the rigid error that the first look's faces share once the part has
+/// moved (seen from elsewhere, its silhouette and noise differ), and of the pose at which later faces
+/// were added to a model.
+const FACE_ERROR_SIGMA: [f64; 2] = [0.002, 0.020];
+/// A part is seen elsewhere than at first once it has moved this far \[m\].
+const DISPLACED: f64 = 0.02;
 
 /// How closely axes follow the faces they are aligned with \[rad\].
 const ALIGNED_SIGMA: f64 = 0.007;
@@ -167,8 +171,8 @@ pub struct KinematicFit {
     pub contact_points: Vec<Vec<Vector3<f64>>>,
     /// The tool's offset in world \[m\].
     pub tool_offset: Vector3<f64>,
-    /// Covariance of all axis parameters, joint by joint, then six face errors a joint, then the
-    /// tool's offset.
+    /// Covariance of all axis parameters, joint by joint, then twelve face errors a joint, then
+    /// the tool's offset.
     pub covariance: DMatrix<f64>,
     /// Negative log density at the solution, up to constants of the data.
     pub cost: f64,
@@ -271,8 +275,9 @@ struct Problem<'a> {
     slot_counts: Vec<usize>,
     /// By window, joint, frame: information after the error that frames at one pose share.
     information: Rc<Vec<Vec<Vec<[Option<Matrix6<f64>>; 2]>>>>,
-    /// By joint: the rigid error of the faces that its child showed later, as ξ about the center.
-    face_errors: Vec<Vector6<f64>>,
+    /// By joint, as ξ about the center: the rigid error of the first look's faces away from where they
+    /// were first seen, and that of the faces that came into view later.
+    face_errors: Vec<[Vector6<f64>; 2]>,
     /// By joint: information of the suggested direction \[rad⁻²\].
     alignments: Vec<f64>,
     contact_points: Vec<Vec<Vector3<f64>>>,
@@ -303,7 +308,7 @@ impl<'a> Problem<'a> {
             by_label,
         };
         problem.alignments = vec![0.0; problem.joints.len()];
-        problem.face_errors = vec![Vector6::zeros(); problem.joints.len()];
+        problem.face_errors = vec![[Vector6::zeros(); 2]; problem.joints.len()];
         problem.separate_frames();
         problem.information = Rc::new(problem.informations(|_, _, _| 1.0));
         problem.contact_points = (0..windows.len()).map(|w| problem.initial_contact_points(w)).collect();
@@ -372,12 +377,19 @@ impl<'a> Problem<'a> {
     }
 
     /// Residual and information of each measurement of a joint's child in a frame, by faces.
-    fn residuals(&self, w: usize, j: usize, frame: usize, predicted: &Pose) -> impl Iterator<Item = (usize, Vector6<f64>, Matrix6<f64>)> {
+    ///
+    /// The first is which rigid error it shares, if any.
+    fn residuals(&self, w: usize, j: usize, frame: usize, predicted: &Pose) -> impl Iterator<Item = (Option<usize>, Vector6<f64>, Matrix6<f64>)> {
+        let joint = &self.joints[j];
+        let shift = (predicted.transform_point(&joint.center) - joint.center).norm();
+        let turn = (predicted.rotation - Matrix3::identity()).norm() * joint.radius;
+        let displaced = shift + turn > DISPLACED;
         let one = |face: usize| {
             let information = self.information[w][j][frame][face]?;
             let measured = self.measured(w, j, frame, face)?;
             let r = pose_residual(&self.joints[j], &measured.displacement, predicted);
-            Some((face, if face == 0 { r } else { r - self.face_errors[j] }, information))
+            let error = (face == 1 || displaced).then_some(face);
+            Some((error, error.map_or(r, |e| r - self.face_errors[j][e]), information))
         };
         [one(0), one(1)].into_iter().flatten()
     }
@@ -398,8 +410,10 @@ impl<'a> Problem<'a> {
             let turn = joint.alignment(0.0).map_or([0.0; 2], |(turn, _)| turn);
             cost += 0.5 * information * (turn[0] * turn[0] + turn[1] * turn[1]);
         }
-        for (j, error) in self.face_errors.iter().enumerate() {
-            cost += 0.5 * error.component_mul(error).dot(&self.face_error_information(j));
+        for (j, errors) in self.face_errors.iter().enumerate() {
+            for (e, error) in errors.iter().enumerate() {
+                cost += 0.5 * error.component_mul(error).dot(&self.face_error_information(j, e));
+            }
         }
         for joint in self.joints.iter().filter(|j| j.joint_type == JointType::Revolute) {
             cost += 0.5 * (joint.axis.point - joint.center).norm_squared() / joint.axis_point_prior().powi(2);
@@ -433,14 +447,14 @@ impl<'a> Problem<'a> {
         self.joints.iter().map(KinematicJoint::axis_parameters).sum()
     }
 
-    /// Axis parameters, then six face errors a joint, then the tool's offset.
+    /// Axis parameters, then twelve face errors a joint, then the tool's offset.
     fn global_count(&self) -> usize {
-        self.axis_count() + 6 * self.joints.len() + 3
+        self.axis_count() + 12 * self.joints.len() + 3
     }
 
     /// Prior information of a joint's face error, per component.
-    fn face_error_information(&self, joint: usize) -> Vector6<f64> {
-        let length = FACE_ERROR_SIGMA.powi(-2);
+    fn face_error_information(&self, joint: usize, error: usize) -> Vector6<f64> {
+        let length = FACE_ERROR_SIGMA[error].powi(-2);
         let angle = length * self.joints[joint].radius.powi(2);
         Vector6::new(angle, angle, angle, length, length, length)
     }
@@ -473,12 +487,12 @@ impl<'a> Problem<'a> {
             for (j, joint) in self.joints.iter().enumerate() {
                 let into_body = (Pose::from_translation(-joint.center) * displacements[j].inverse()).adjoint_matrix();
                 let twists: Vec<_> = columns[j].iter().map(|(at, v)| (*at, into_body * v)).collect();
-                for (face, r, information) in self.residuals(w, j, frame, &displacements[j]) {
+                for (error, r, information) in self.residuals(w, j, frame, &displacements[j]) {
                     let weight = self.student_weight(r.dot(&(information * r)), 6.0);
                     let mut jacobian = twists.clone();
-                    if face == 1 {
+                    if let Some(error) = error {
                         let unit = |i: usize| -Matrix6::identity().column(i);
-                        jacobian.extend((0..6).map(|i| (Slot::Global(axes + 6 * j + i), unit(i))));
+                        jacobian.extend((0..6).map(|i| (Slot::Global(axes + 12 * j + 6 * error + i), unit(i))));
                     }
                     accumulate(&mut system, &jacobian, &(information * weight), &r);
                 }
@@ -549,13 +563,15 @@ impl<'a> Problem<'a> {
             }
             at += joint.axis_parameters();
         }
-        for (j, error) in self.face_errors.iter().enumerate() {
-            let information = self.face_error_information(j);
-            for i in 0..6 {
-                matrix[(at + i, at + i)] += information[i];
-                gradient[at + i] += information[i] * error[i];
+        for (j, errors) in self.face_errors.iter().enumerate() {
+            for (e, error) in errors.iter().enumerate() {
+                let information = self.face_error_information(j, e);
+                for i in 0..6 {
+                    matrix[(at + i, at + i)] += information[i];
+                    gradient[at + i] += information[i] * error[i];
+                }
+                at += 6;
             }
-            at += 6;
         }
         let offset_information = 1.0 / self.settings.tool_offset_sigma.powi(2);
         for i in 0..3 {
@@ -615,7 +631,7 @@ impl<'a> Problem<'a> {
             joint.retract(&global_step.as_slice()[offset..offset + count]);
             offset += count;
         }
-        for error in &mut next.face_errors {
+        for error in next.face_errors.iter_mut().flatten() {
             *error += global_step.fixed_rows::<6>(offset);
             offset += 6;
         }

@@ -5,7 +5,7 @@
 //! on a grid against the reference model, and the best few are refined. A part whose motion is
 //! explained becomes a possible parent for the others.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{Matrix6, Vector3, Vector6};
 
@@ -24,6 +24,8 @@ const EXPLAINED: f64 = 0.12;
 const TOOL_EXPLAINED: f64 = 0.003;
 /// Share of the largest eigenvalue of a factor that rough normals may pretend to hold.
 pub const FALSE_SHARE: f64 = 0.01;
+/// A motion may start this far from where the part was, before it costs \[m\].
+const START_JUMP: f64 = 0.006;
 /// A linearization is believed about this far \[m\]: weaker directions stay as predicted.
 const MEASURED_WITHIN: f64 = 0.010;
 /// Scans with fewer points say nothing of a pose.
@@ -61,6 +63,8 @@ pub struct Scene<'a> {
     pub start: &'a BTreeMap<Label, Pose>,
     /// Joints known so far, parents first.
     pub joints: &'a [KinematicJoint],
+    /// Parts that the tool has moved before: their joints are known from their own motion.
+    pub touched_before: &'a BTreeSet<Label>,
     /// The part that is fixed to the world.
     pub root: Label,
     /// Whether the tool's position is used as an observation.
@@ -179,15 +183,19 @@ impl Scene<'_> {
     fn best_motion(&self, label: Label, known: &BTreeMap<Label, Motion>) -> Option<Motion> {
         let model = &self.models[&label];
         let mut best = Best { motion: None, score: f64::INFINITY };
+        let mut known_joint = false;
         let score = |motion: &Motion, complexity: f64| {
             let miss = self.tool_miss(label, &motion.displacements);
-            motion.excess + complexity + 0.05 * (miss / TOOL_EXPLAINED).min(20.0)
+            // A motion starts where the part was.
+            let jump = motion.displacements.first().map_or(0.0, |d| travel(model, &self.start_of(label), d));
+            motion.excess + complexity + 0.05 * (miss / TOOL_EXPLAINED).min(20.0) + 0.05 * (jump / START_JUMP).min(20.0)
         };
         // Along the joint that is known.
         if let Some(joint) = self.joints.iter().find(|joint| joint.child == label) {
             let parent = joint.parent.map(|p| self.joints[p].child);
             if let Some(parents) = self.parent_track(parent, known) {
                 let motion = self.along(label, &joint.screw(), joint.joint_type, &parents);
+                known_joint = self.touched_before.contains(&label);
                 best.offer(score(&motion, 0.0), motion);
             }
         }
@@ -201,7 +209,7 @@ impl Scene<'_> {
         let still = self.evaluate(label, |_| self.start_of(label));
         if let Some(motion) = &best.motion {
             let held = self.tool_miss(label, &motion.displacements) < 1.5 * TOOL_EXPLAINED;
-            if held && (motion.excess < EXPLAINED || motion.excess < 0.3 * still.excess) {
+            if held && (known_joint || motion.excess < EXPLAINED || motion.excess < 0.3 * still.excess) {
                 return best.motion;
             }
         }

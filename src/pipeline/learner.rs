@@ -1,6 +1,6 @@
 //! What has been learned of the object, window by window: the worker side of the pipeline.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{DMatrix, Vector3};
 
@@ -25,7 +25,9 @@ const RESTS: f64 = 1e-6;
 /// A face's normal suggests an axis within 15° of it.
 const SUGGESTION_COSINE: f64 = 0.966;
 /// Visible surfaces of parts that are joined are this close \[m\]; the joint itself is mostly hidden.
-const CONTACT_GAP: f64 = 0.05;
+const CONTACT_GAP: f64 = 0.03;
+/// Standard deviation of what occlusion adds to that \[m\].
+const CONTACT_GAP_SIGMA: f64 = 0.02;
 /// Log prior lost at most by parts that are far apart \[nats\].
 const FARTHEST_PENALTY: f64 = 40.0;
 /// Scans kept from each window for growing a part's model, and in all.
@@ -70,6 +72,8 @@ pub struct Learner {
     keyframes: BTreeMap<Label, Vec<(usize, usize, Vec<ScanPoint>)>>,
     /// What scans cost at known poses.
     pub baselines: BTreeMap<Label, Baseline>,
+    /// Parts that the tool has moved.
+    touched: BTreeSet<Label>,
     /// Distance between the surfaces of each pair of parts at the first look \[m\], smaller label first.
     gaps: BTreeMap<(Label, Label), f64>,
     /// Displacements after the last window.
@@ -104,6 +108,7 @@ impl Learner {
             models,
             reference,
             keyframes: BTreeMap::new(),
+            touched: BTreeSet::new(),
             gaps,
             baselines: BTreeMap::new(),
             displacements: BTreeMap::new(),
@@ -152,6 +157,7 @@ impl Learner {
             baselines: &self.baselines,
             start: &self.displacements,
             joints: self.joints(),
+            touched_before: &self.touched,
             root: self.root,
             use_tool: self.use_tool,
         };
@@ -165,6 +171,8 @@ impl Learner {
             wrenches: job.wrenches.clone(),
             ..WindowObservations::default()
         };
+        let moved = |label: &Label| motions.get(label).is_some_and(|m| m.moved);
+        self.touched.extend(job.contacts.iter().map(|c| c.label).filter(moved));
         for (label, motion) in &motions {
             self.tracks.entry(*label).or_default().push(motion.displacements.clone());
         }
@@ -364,7 +372,7 @@ impl Learner {
                 still.map(|l| gap(*l)).fold(f64::INFINITY, f64::min)
             }
         };
-        -(0.5 * ((gap - CONTACT_GAP).max(0.0) / CONTACT_GAP).powi(2)).min(FARTHEST_PENALTY)
+        -(0.5 * ((gap - CONTACT_GAP).max(0.0) / CONTACT_GAP_SIGMA).powi(2)).min(FARTHEST_PENALTY)
     }
 
     /// The likeliest parent and type of each mover, as a tree with parents first.
