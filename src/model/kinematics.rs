@@ -22,7 +22,7 @@ use crate::types::Label;
 /// Standard deviations \[m\] of the rigid error that the first look's faces share once the part has
 /// moved (seen from elsewhere, its silhouette and noise differ), and of the pose at which later faces
 /// were added to a model.
-const FACE_ERROR_SIGMA: [f64; 2] = [0.002, 0.020];
+const FACE_ERROR_SIGMA: [f64; 2] = [0.001, 0.020];
 /// A part is seen elsewhere than at first once it has moved this far \[m\].
 const DISPLACED: f64 = 0.02;
 

@@ -324,24 +324,31 @@ impl Learner {
                 starts.push(Axis { direction: seed.direction, point: seed.point.unwrap_or(part.center) });
             }
         }
-        if known.is_some() {
-            return starts;
-        }
-        for window in relative {
-            for contact in &window.contacts {
-                let track: Vec<Vector3<f64>> = contact.track.iter().map(|(_, x, _)| *x).collect();
-                let seed = match joint_type {
-                    JointType::Prismatic => fit_line(&track),
-                    _ => fit_circle(&track),
-                };
-                if let Some((seed, _)) = seed {
-                    starts.push(Axis { direction: seed.direction, point: seed.point.unwrap_or(part.center) });
-                }
+        // The two longest tracks of the tool, seen from the parent.
+        let mut tracks: Vec<Vec<Vector3<f64>>> = relative
+            .iter()
+            .flat_map(|window| &window.contacts)
+            .map(|contact| contact.track.iter().map(|(_, x, _)| *x).collect())
+            .collect();
+        tracks.sort_by(|a, b| extent(b).total_cmp(&extent(a)));
+        for track in tracks.iter().take(2) {
+            let seed = match joint_type {
+                JointType::Prismatic => fit_line(track),
+                _ => fit_circle(track),
+            };
+            if let Some((seed, _)) = seed {
+                starts.push(Axis { direction: seed.direction, point: seed.point.unwrap_or(part.center) });
             }
         }
         starts.extend(axes_from_motion(part, joint_type, relative));
-        starts.truncate(4);
-        starts
+        let mut distinct: Vec<Axis> = Vec::new();
+        for axis in starts {
+            if distinct.iter().all(|other| !same_axis(&axis, other, &part.center, joint_type)) {
+                distinct.push(axis);
+            }
+        }
+        distinct.truncate(3);
+        distinct
     }
 
     /// Log weights of the edges between what never moved (node 0) and the parts that did, in the
@@ -504,6 +511,20 @@ impl Learner {
             }
         }
     }
+}
+
+/// Diagonal of a track's bounding box \[m\].
+fn extent(track: &Vec<Vector3<f64>>) -> f64 {
+    let low = track.iter().fold(Vector3::repeat(f64::INFINITY), |low, x| low.inf(x));
+    let high = track.iter().fold(Vector3::repeat(f64::NEG_INFINITY), |high, x| high.sup(x));
+    if track.is_empty() { 0.0 } else { (high - low).norm() }
+}
+
+/// Whether a fit from either axis would end at the same place: 3° and 15 mm abreast of the part.
+fn same_axis(first: &Axis, second: &Axis, center: &Vector3<f64>, joint_type: JointType) -> bool {
+    let abreast = |axis: &Axis| axis.point + axis.direction * axis.direction.dot(&(center - axis.point));
+    let near = joint_type == JointType::Prismatic || (abreast(first) - abreast(second)).norm() < 0.015;
+    near && first.direction.cross(&second.direction).norm() < 0.05
 }
 
 /// Smallest distance between the surfels of each pair of parts \[m\].
