@@ -20,11 +20,11 @@ use crate::mechanism::JointType;
 use crate::types::Label;
 
 /// Standard deviations \[m\] of the rigid error that the first look's faces share once the part has
-/// moved (seen from elsewhere, its silhouette and noise differ), and of the pose at which later faces
+/// turned (seen from another side, its silhouette and noise differ), and of the pose at which later faces
 /// were added to a model.
-const FACE_ERROR_SIGMA: [f64; 2] = [0.001, 0.020];
-/// A part is seen elsewhere than at first once it has moved this far \[m\].
-const DISPLACED: f64 = 0.02;
+const FACE_ERROR_SIGMA: [f64; 2] = [0.0015, 0.020];
+/// A hinged part is seen from another side once it has turned; a sliding one keeps its side: √2 times the angle \[rad\].
+const TURNED: f64 = 0.1;
 
 /// How closely axes follow the faces they are aligned with \[rad\].
 const ALIGNED_SIGMA: f64 = 0.007;
@@ -365,7 +365,9 @@ impl<'a> Problem<'a> {
         (0..self.windows.len())
             .map(|w| {
                 let frames = self.windows[w].times_s.len();
-                (0..self.joints.len()).map(|j| (0..frames).map(|k| [0, 1].map(|face| one(w, j, k, face))).collect()).collect()
+                (0..self.joints.len())
+                    .map(|j| (0..frames).map(|k| [0, 1].map(|face| one(w, j, k, face))).collect())
+                    .collect()
             })
             .collect()
     }
@@ -379,16 +381,20 @@ impl<'a> Problem<'a> {
     /// Residual and information of each measurement of a joint's child in a frame, by faces.
     ///
     /// The first is which rigid error it shares, if any.
-    fn residuals(&self, w: usize, j: usize, frame: usize, predicted: &Pose) -> impl Iterator<Item = (Option<usize>, Vector6<f64>, Matrix6<f64>)> {
-        let joint = &self.joints[j];
-        let shift = (predicted.transform_point(&joint.center) - joint.center).norm();
-        let turn = (predicted.rotation - Matrix3::identity()).norm() * joint.radius;
-        let displaced = shift + turn > DISPLACED;
+    fn residuals(
+        &self,
+        w: usize,
+        j: usize,
+        frame: usize,
+        predicted: &Pose,
+    ) -> impl Iterator<Item = (Option<usize>, Vector6<f64>, Matrix6<f64>)> {
+        let turned = self.joints[j].joint_type == JointType::Revolute
+            && (predicted.rotation - Matrix3::identity()).norm() > TURNED;
         let one = |face: usize| {
             let information = self.information[w][j][frame][face]?;
             let measured = self.measured(w, j, frame, face)?;
             let r = pose_residual(&self.joints[j], &measured.displacement, predicted);
-            let error = (face == 1 || displaced).then_some(face);
+            let error = (face == 1 || turned).then_some(face);
             Some((error, error.map_or(r, |e| r - self.face_errors[j][e]), information))
         };
         [one(0), one(1)].into_iter().flatten()
@@ -549,7 +555,9 @@ impl<'a> Problem<'a> {
         for (j, joint) in self.joints.iter().enumerate() {
             let arm = joint.axis.point - joint.center;
             let (first, second) = orthonormal_pair(&joint.axis.direction);
-            for (i, pull) in [0.0, 0.0, arm.dot(&first), arm.dot(&second)].into_iter().take(joint.axis_parameters()).enumerate() {
+            for (i, pull) in
+                [0.0, 0.0, arm.dot(&first), arm.dot(&second)].into_iter().take(joint.axis_parameters()).enumerate()
+            {
                 let information = if i < 2 { 1.0 } else { joint.axis_point_prior().powi(-2) };
                 matrix[(at + i, at + i)] += information;
                 gradient[at + i] += information * pull;
@@ -671,7 +679,8 @@ impl<'a> Problem<'a> {
                 sharing.insert((*w, j, *frame), near as f64);
             }
         }
-        self.information = Rc::new(self.informations(|w, j, frame| sharing.get(&(w, j, frame)).copied().unwrap_or(1.0)));
+        self.information =
+            Rc::new(self.informations(|w, j, frame| sharing.get(&(w, j, frame)).copied().unwrap_or(1.0)));
     }
 
     /// Frees joints that were taken to rest through a window where the data object: a score test on
@@ -724,9 +733,8 @@ impl<'a> Problem<'a> {
             let deviations = systems[w].local.clone().cholesky().map(|c| c.inverse().diagonal());
             let mut next_slot = 0;
             for j in 0..self.joints.len() {
-                let sigma = |frame: usize| {
-                    deviations.as_ref().map_or(0.0, |d| d[self.slots[w][j][frame]].max(0.0).sqrt())
-                };
+                let sigma =
+                    |frame: usize| deviations.as_ref().map_or(0.0, |d| d[self.slots[w][j][frame]].max(0.0).sqrt());
                 let runs = rest_runs(&self.positions[w][j], sigma, self.settings.rest_deviations);
                 for run in runs {
                     let mean = run.clone().map(|k| self.positions[w][j][k]).sum::<f64>() / run.len() as f64;
@@ -748,9 +756,7 @@ impl<'a> Problem<'a> {
         let globals = matrix.nrows();
         let covariance = matrix.cholesky().map_or_else(|| DMatrix::identity(globals, globals), |c| c.inverse());
         let moves = (0..self.joints.len())
-            .map(|j| {
-                self.slots.iter().map(|w| w[j].windows(2).filter(|pair| pair[0] != pair[1]).count()).sum()
-            })
+            .map(|j| self.slots.iter().map(|w| w[j].windows(2).filter(|pair| pair[0] != pair[1]).count()).sum())
             .collect();
         KinematicFit {
             joints: self.joints,
