@@ -8,10 +8,11 @@ use std::sync::Arc;
 
 use nalgebra::{Matrix3, Vector3};
 
+use super::explain::measure;
 use super::{Frame, Learner, Output, nearest_label};
 use crate::math::Pose;
 use crate::mechanism::WrenchSample;
-use crate::model::PoseMeasurement;
+use crate::registration::AlignmentSettings;
 use crate::tracking::{Filter, FreePart, TrackedMechanism};
 use crate::types::{AppliedWrench, Label, Stamp};
 
@@ -23,6 +24,8 @@ const PATIENCE: f64 = 0.3;
 const SMOOTHING: usize = 4;
 /// Contact outlives the force by this \[s\].
 const RELEASE: f64 = 0.2;
+/// Points further from the surface where it is expected say nothing \[m\].
+const POSE_GATE: f64 = 0.03;
 /// Tool positions in a row that deny the hold.
 const DENIALS: usize = 4;
 /// A new posterior's filter starts this long before its window closed \[s\].
@@ -60,7 +63,7 @@ struct Touch {
 /// What a stamp brought.
 struct Seen {
     time_s: f64,
-    measurements: BTreeMap<Label, PoseMeasurement>,
+    frame: Frame,
     touches: Vec<Touch>,
     tool_sigma: f64,
 }
@@ -189,8 +192,8 @@ impl Forecaster {
     /// Takes in a frame as it was measured; `rest_force` is what the sensor reads untouched \[N\].
     pub fn push_frame(
         &mut self,
-        frame: &Frame,
-        measurements: BTreeMap<Label, PoseMeasurement>,
+        frame: Frame,
+        learner: Option<&Learner>,
         zero: Stamp,
         rest_force: Vector3<f64>,
     ) -> Vec<Output> {
@@ -198,18 +201,18 @@ impl Forecaster {
         let early = std::mem::take(&mut self.early);
         let mut outputs: Vec<Output> = early.iter().flat_map(|wrench| self.push_wrench(wrench)).collect();
         self.labels.extend(frame.scans.keys());
-        let touches = self.touches(frame, &rest_force);
-        let seen = Seen { time_s: frame.time_s, measurements, touches, tool_sigma: self.tool_variance.sqrt().max(TOOL_SIGMA.0) };
+        let touches = self.touches(&frame, &rest_force);
+        let now_s = frame.time_s;
+        let seen = Seen { time_s: now_s, frame, touches, tool_sigma: self.tool_variance.sqrt().max(TOOL_SIGMA.0) };
         self.seen.push_back(seen);
-        if !self.restart(frame.time_s)
+        if !self.restart(now_s, learner)
             && let (Some(filter), Some(seen)) = (&mut self.filter, self.seen.back())
         {
-            follow(filter, seen, &self.samples, self.use_tool, &mut self.denials);
+            follow(filter, seen, &self.samples, learner, &mut self.denials);
         }
-        self.forget(frame.time_s);
+        self.forget(now_s);
         let free = self.free_parts();
-        self.pending.push_back(Pending { time_s: frame.time_s, filter: self.filter.clone(), free, root: self.root });
-        let now_s = frame.time_s;
+        self.pending.push_back(Pending { time_s: now_s, filter: self.filter.clone(), free, root: self.root });
         let newest_s = self.samples.last().map_or(f64::NEG_INFINITY, |s| s.stamp_s);
         outputs.extend(self.ready(|pending| newest_s >= pending.time_s + HORIZONS[2] || now_s > pending.time_s + HORIZONS[2] + PATIENCE));
         outputs
@@ -221,7 +224,7 @@ impl Forecaster {
     }
 
     /// A posterior that counts by now takes over: the filter starts anew from its fit.
-    fn restart(&mut self, now_s: f64) -> bool {
+    fn restart(&mut self, now_s: f64, learner: Option<&Learner>) -> bool {
         let Some(at) = self.waiting.iter().rposition(|waiting| waiting.from_s <= now_s + 1e-9) else { return false };
         let Some(new) = self.waiting.drain(..=at).next_back() else { return false };
         self.places = new.displacements;
@@ -232,7 +235,7 @@ impl Forecaster {
         };
         let mut filter = Filter::new(mechanism, new.start_s, new.positions, new.rates, FIT_DEVIATION);
         for seen in self.seen.iter().filter(|seen| seen.time_s > new.start_s + 1e-9) {
-            follow(&mut filter, seen, &self.samples, self.use_tool, &mut self.denials);
+            follow(&mut filter, seen, &self.samples, learner, &mut self.denials);
         }
         self.filter = Some(filter);
         true
@@ -280,6 +283,7 @@ impl Forecaster {
             {
                 *contact.votes.entry(label).or_default() += 1;
                 let most = contact.votes.iter().max_by_key(|(_, votes)| **votes).map(|(label, _)| *label);
+                tracing::debug!(time_s = frame.time_s, ?nearest, ?most, "touch");
                 if contact.label != most {
                     begins = true;
                     contact.label = most;
@@ -358,7 +362,8 @@ impl Forecaster {
 }
 
 /// The filter through what one stamp brought.
-fn follow(filter: &mut Filter, seen: &Seen, samples: &[WrenchSample], use_tool: bool, denials: &mut usize) {
+fn follow(filter: &mut Filter, seen: &Seen, samples: &[WrenchSample], learner: Option<&Learner>, denials: &mut usize) {
+    let Some(learner) = learner else { return };
     let from_s = filter.time_s();
     for touch in seen.touches.iter().filter(|touch| touch.time_s > from_s) {
         filter.advance(touch.time_s, samples);
@@ -370,7 +375,7 @@ fn follow(filter: &mut Filter, seen: &Seen, samples: &[WrenchSample], use_tool: 
         if touch.begins || filter.held().is_none_or(|held| held.body != body) {
             *denials = 0;
             filter.hold(body, &touch.tool_in_world, seen.tool_sigma);
-        } else if use_tool {
+        } else if learner.use_tool {
             if filter.correct_by_tool(&touch.tool_in_world, seen.tool_sigma) {
                 *denials = 0;
             } else {
@@ -389,7 +394,13 @@ fn follow(filter: &mut Filter, seen: &Seen, samples: &[WrenchSample], use_tool: 
         filter.release();
     }
     filter.advance(seen.time_s, samples);
-    for (label, measurement) in &seen.measurements {
-        filter.correct_by_pose(*label, measurement);
+    // Parts that nothing moves are where they were.
+    let settings = AlignmentSettings { gate: POSE_GATE, ..AlignmentSettings::default() };
+    for (label, displacement) in filter.moving_parts() {
+        if let (Some(model), Some(scan)) = (learner.models.get(&label), seen.frame.scans.get(&label))
+            && let Some(measurement) = measure(model, scan, &displacement, &settings)
+        {
+            filter.correct_by_pose(label, &measurement);
+        }
     }
 }

@@ -170,7 +170,7 @@ impl Pipeline {
         let frame = frame_of(stamp.seconds_since(zero), clouds);
         let mut outputs = self.observe(&frame);
         let moving = self.moving;
-        let seen = self.forecaster.is_some().then(|| (frame.clone(), measurements(&outputs)));
+        let seen = self.forecaster.is_some().then(|| frame.clone());
         if !self.cutter.as_ref().is_some_and(WindowCutter::is_open) && self.learner.is_none() {
             self.reference.push(frame.clone());
         }
@@ -180,12 +180,12 @@ impl Pipeline {
         }
         let closed = job.is_some();
         outputs.extend(job.map(|job| self.learn(&job)));
-        if let (Some(forecaster), Some((frame, measurements))) = (&mut self.forecaster, seen) {
+        if let (Some(forecaster), Some(frame)) = (&mut self.forecaster, seen) {
             if let Some(learner) = self.learner.as_ref().filter(|_| closed) {
                 forecaster.learned(learner);
             }
             let rest_force = self.cutter.as_ref().and_then(|cutter| cutter.rest_force).unwrap_or_default();
-            outputs.extend(forecaster.push_frame(&frame, measurements, zero, rest_force));
+            outputs.extend(forecaster.push_frame(frame, self.learner.as_ref(), zero, rest_force));
         }
         outputs
     }
@@ -272,15 +272,6 @@ impl Pipeline {
             travel(model, old, new) > 0.006 && cost(old) - cost(new) > MOVING_COST
         })
     }
-}
-
-/// What a frame's observations measured.
-fn measurements(outputs: &[Output]) -> BTreeMap<Label, PoseMeasurement> {
-    let measurement = |output: &Output| match output {
-        Output::Observation { label, measurement, .. } => Some((*label, *measurement)),
-        _ => None,
-    };
-    outputs.iter().filter_map(measurement).collect()
 }
 
 /// The part whose points are nearest to a place, by majority of the nearest few.

@@ -26,8 +26,6 @@ const STUCK_MEMORY: f64 = 0.03;
 const SHARED_ERROR: f64 = 0.004;
 /// χ² of three or six numbers that no filter in order sees.
 const GATE: f64 = 30.0;
-/// Poses in a row beyond the gate that make the filter give way.
-const GIVE_WAY: usize = 3;
 /// Softest standard deviation of the point first held, beside the tool's own \[m\].
 const HELD_DEVIATION: f64 = 0.0005;
 
@@ -49,8 +47,6 @@ pub struct Filter {
     /// Of (positions, rates, held point).
     pub(super) covariance: DMatrix<f64>,
     pub(super) held: Option<Held>,
-    /// Poses in a row that disagreed, by joint.
-    misses: Vec<usize>,
     workspace: Workspace<f64>,
     inertias: Vec<f64>,
     cursor: usize,
@@ -76,7 +72,7 @@ impl Filter {
         }
         let workspace = Workspace::new(&mechanism.tree);
         let state = State::new(positions, rates);
-        Self { mechanism, time_s, state, covariance, held: None, misses: vec![0; n], workspace, inertias, cursor: 0 }
+        Self { mechanism, time_s, state, covariance, held: None, workspace, inertias, cursor: 0 }
     }
 
     /// What it filters.
@@ -107,6 +103,18 @@ impl Filter {
     /// Whether nothing moves and nothing is held.
     pub fn rests(&self) -> bool {
         self.held.is_none() && self.state.rates.iter().all(|rate| *rate == 0.0)
+    }
+
+    /// Parts that may move, with their displacements: those that the tool's hold or a rate reaches.
+    pub fn moving_parts(&self) -> Vec<(Label, Pose)> {
+        let driven = self.held.map(|held| self.mechanism.chain(held.body)).unwrap_or_default();
+        let moves = |joint: usize| driven.contains(&joint) || self.state.rates[joint] != 0.0;
+        let displacements = self.mechanism.tree.displacements(&self.state.positions);
+        let joints = self.mechanism.joints.iter().zip(displacements).enumerate();
+        joints
+            .filter(|(body, _)| self.mechanism.chain(*body).into_iter().any(moves))
+            .map(|(_, (joint, displacement))| (joint.child, displacement))
+            .collect()
     }
 
     /// The tool takes hold of a part where it is now; its position is reported with `sigma_m`.
@@ -281,22 +289,8 @@ impl Filter {
         let Some(inverse) = spread.try_inverse() else { return };
         let innovation = SVector::<f64, 6>::from(-residual);
         if innovation.dot(&(inverse * innovation)) > GATE {
-            self.misses[body] += 1;
-            if self.misses[body] < GIVE_WAY {
-                return;
-            }
-            let reach = reach(&mechanism, body);
-            self.covariance[(body, body)] += (0.02 / reach).powi(2);
-            self.covariance[(n + body, n + body)] += (0.05 / reach).powi(2);
-        } else {
-            self.misses[body] = 0;
-            // What rests untouched is known better than one more frame can tell.
-            if mechanism.chain(body).iter().all(|&joint| self.state.rates[joint] == 0.0) && self.held.is_none() {
-                return;
-            }
+            return;
         }
-        let spread = SMatrix::<f64, 6, 6>::from_iterator((&jacobian * &self.covariance * jacobian.transpose()).iter().copied()) + noise;
-        let Some(inverse) = spread.try_inverse() else { return };
         let inverse = DMatrix::from_column_slice(6, 6, inverse.as_slice());
         self.correct(&jacobian, &inverse, &DVector::from_column_slice(innovation.as_slice()));
     }
