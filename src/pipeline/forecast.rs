@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::explain::measure;
+use super::explain::{measure, travel};
 use super::{Frame, Learner, Output, nearest_label};
 use crate::math::Pose;
 use crate::mechanism::WrenchSample;
@@ -26,6 +26,8 @@ const SMOOTHING: usize = 4;
 const RELEASE: f64 = 0.2;
 /// Points further from the surface where it is expected say nothing \[m\].
 const POSE_GATE: f64 = 0.03;
+/// A part that went less from one frame to the next has come to rest \[m\].
+const STILL: f64 = 0.002;
 /// Tool positions in a row that deny the hold.
 const DENIALS: usize = 4;
 /// A new posterior's filter starts this long before its window closed \[s\].
@@ -96,6 +98,8 @@ pub(super) struct Forecaster {
     source: Option<usize>,
     filter: Option<Filter>,
     denials: usize,
+    /// Moving parts as measured in the frame before.
+    last: BTreeMap<Label, Pose>,
     contact: Option<ContactNow>,
     /// Readings looked at for contact, in time.
     looked_s: f64,
@@ -121,6 +125,7 @@ impl Forecaster {
             source: None,
             filter: None,
             denials: 0,
+            last: BTreeMap::new(),
             contact: None,
             looked_s: f64::NEG_INFINITY,
             tool_variance: TOOL_SIGMA.1.powi(2),
@@ -208,7 +213,7 @@ impl Forecaster {
         if !self.restart(now_s, learner)
             && let (Some(filter), Some(seen)) = (&mut self.filter, self.seen.back())
         {
-            follow(filter, seen, &self.samples, learner, &mut self.denials);
+            follow(filter, seen, &self.samples, learner, (&mut self.denials, &mut self.last));
         }
         self.forget(now_s);
         let free = self.free_parts();
@@ -235,7 +240,7 @@ impl Forecaster {
         };
         let mut filter = Filter::new(mechanism, new.start_s, new.positions, new.rates, FIT_DEVIATION);
         for seen in self.seen.iter().filter(|seen| seen.time_s > new.start_s + 1e-9) {
-            follow(&mut filter, seen, &self.samples, learner, &mut self.denials);
+            follow(&mut filter, seen, &self.samples, learner, (&mut self.denials, &mut self.last));
         }
         self.filter = Some(filter);
         true
@@ -362,7 +367,7 @@ impl Forecaster {
 }
 
 /// The filter through what one stamp brought.
-fn follow(filter: &mut Filter, seen: &Seen, samples: &[WrenchSample], learner: Option<&Learner>, denials: &mut usize) {
+fn follow(filter: &mut Filter, seen: &Seen, samples: &[WrenchSample], learner: Option<&Learner>, (denials, last): (&mut usize, &mut BTreeMap<Label, Pose>)) {
     let Some(learner) = learner else { return };
     let from_s = filter.time_s();
     for touch in seen.touches.iter().filter(|touch| touch.time_s > from_s) {
@@ -395,12 +400,20 @@ fn follow(filter: &mut Filter, seen: &Seen, samples: &[WrenchSample], learner: O
     }
     filter.advance(seen.time_s, samples);
     // Parts that nothing moves are where they were.
+    let (mut measured, mut still) = (BTreeMap::new(), true);
     let settings = AlignmentSettings { gate: POSE_GATE, ..AlignmentSettings::default() };
     for (label, displacement) in filter.moving_parts() {
         if let (Some(model), Some(scan)) = (learner.models.get(&label), seen.frame.scans.get(&label))
             && let Some(measurement) = measure(model, scan, &displacement, &settings)
         {
             filter.correct_by_pose(label, &measurement);
+            let (before, after) = (last.get(&label), measurement.displacement);
+            still &= before.is_some_and(|before| travel(model, before, &after) < STILL);
+            measured.insert(label, after);
         }
     }
+    if filter.held().is_none() && !measured.is_empty() && still {
+        filter.rest();
+    }
+    *last = measured;
 }

@@ -26,6 +26,14 @@ const STUCK_MEMORY: f64 = 0.03;
 const SHARED_ERROR: f64 = 0.004;
 /// χ² of three or six numbers that no filter in order sees.
 const GATE: f64 = 30.0;
+/// Innovations this much larger than expected, on the mean of the last so many, raise the process noise.
+const SURPRISED: f64 = 1.5;
+const SURPRISE_SHARE: f64 = 0.1;
+const MOST_UNEASE: f64 = 3000.0;
+/// An innovation beyond the gate is the joints' if their motion explains all but this \[m\] ...
+const EXPLAINED: f64 = 0.005;
+/// ... and it is not larger than this \[m\]: the tool let go.
+const FURTHEST: f64 = 0.05;
 /// Softest standard deviation of the point first held, beside the tool's own \[m\].
 const HELD_DEVIATION: f64 = 0.0005;
 
@@ -49,6 +57,10 @@ pub struct Filter {
     pub(super) held: Option<Held>,
     workspace: Workspace<f64>,
     inertias: Vec<f64>,
+    /// Factor on the process noise while innovations are larger than expected.
+    pub(super) unease: f64,
+    /// Running mean of the tool's squared innovations in units of their variance.
+    surprise: f64,
     cursor: usize,
 }
 
@@ -72,7 +84,7 @@ impl Filter {
         }
         let workspace = Workspace::new(&mechanism.tree);
         let state = State::new(positions, rates);
-        Self { mechanism, time_s, state, covariance, held: None, workspace, inertias, cursor: 0 }
+        Self { mechanism, time_s, state, covariance, held: None, workspace, inertias, unease: 1.0, surprise: 1.0, cursor: 0 }
     }
 
     /// What it filters.
@@ -98,6 +110,22 @@ impl Filter {
     /// What the tool holds.
     pub fn held(&self) -> Option<Held> {
         self.held
+    }
+
+    /// Joints that stay: at rest, and not between the world and what is held. Friction holds them, or
+    /// they would not rest; a model that says otherwise is wrong.
+    pub(super) fn resting(&self) -> Vec<(usize, f64)> {
+        let driven = self.held.map(|held| self.mechanism.chain(held.body)).unwrap_or_default();
+        let rests = |joint: &usize| self.state.rates[*joint] == 0.0 && !driven.contains(joint);
+        (0..self.mechanism.joints.len()).filter(rests).map(|joint| (joint, self.state.positions[joint])).collect()
+    }
+
+    /// Everything that nothing touches is at rest.
+    pub fn rest(&mut self) {
+        if self.held.is_none() {
+            self.state.rates.fill(0.0);
+            self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
+        }
     }
 
     /// Whether nothing moves and nothing is held.
@@ -174,12 +202,13 @@ impl Filter {
             point: WrenchPoint::Carried(held.point),
             ..WrenchTrack::new(held.body, samples)
         });
-        for _ in 0..count {
-            let middle_s = self.time_s + 0.5 * length_s;
+        let resting = self.resting();
+        for i in 0..count {
+            let middle_s = self.time_s + (i as f64 + 0.5) * length_s;
             let wrench: Option<BodyWrench<f64>> = track.as_ref().map(|track| track.wrench(middle_s, &mut self.cursor));
             let applied = Step { middle_s, length_s };
             step(&mechanism.tree, &mut self.state, wrench.as_slice(), applied, &mut self.workspace);
-            self.time_s += length_s;
+            keep(&resting, &mut self.state);
         }
         self.time_s = to_s;
         self.grow(span);
@@ -207,7 +236,7 @@ impl Filter {
                 None if stuck => 0.0,
                 None => reach(&self.mechanism, joint).powi(2),
             };
-            let density = FORCE_DENSITY * self.mechanism.noise_scale * lever / self.inertias[joint].powi(2);
+            let density = FORCE_DENSITY * self.mechanism.noise_scale * self.unease * lever / self.inertias[joint].powi(2);
             self.covariance[(n + joint, n + joint)] += density * span;
             self.covariance[(joint, joint)] += density * span.powi(3) / 3.0;
             self.covariance[(n + joint, joint)] += density * span.powi(2) / 2.0;
@@ -256,11 +285,34 @@ impl Filter {
         let noise = Matrix3::identity() * (sigma_m * sigma_m + HELD_DEVIATION.powi(2));
         let spread = SMatrix::<f64, 3, 3>::from_iterator((&jacobian * &self.covariance * jacobian.transpose()).iter().copied()) + noise;
         let Some(inverse) = spread.try_inverse() else { return false };
-        if innovation.dot(&(inverse * innovation)) > GATE {
+        let squared = innovation.dot(&(inverse * innovation));
+        let slopes = jacobian.view((0, 0), (3, n)).into_owned();
+        if squared > GATE && !self.give_way(&slopes, &innovation) {
             return false;
         }
+        self.surprise += SURPRISE_SHARE * ((squared / 3.0).min(GATE) - self.surprise);
+        self.unease = if self.surprise > SURPRISED { (self.unease * 1.25).min(MOST_UNEASE) } else { (self.unease * 0.97).max(1.0) };
+        let spread = SMatrix::<f64, 3, 3>::from_iterator((&jacobian * &self.covariance * jacobian.transpose()).iter().copied()) + noise;
+        let Some(inverse) = spread.try_inverse() else { return false };
         let inverse = DMatrix::from_column_slice(3, 3, inverse.as_slice());
         self.correct(&jacobian, &inverse, &DVector::from_column_slice(innovation.as_slice()));
+        true
+    }
+
+    /// Widens the joints' covariance where their motion explains an innovation beyond the gate [m].
+    fn give_way(&mut self, slopes: &DMatrix<f64>, innovation: &Vector3<f64>) -> bool {
+        let n = self.mechanism.joints.len();
+        let normal = slopes.transpose() * slopes + DMatrix::identity(n, n) * 1e-6;
+        let Some(cholesky) = normal.cholesky() else { return false };
+        let change = cholesky.solve(&(slopes.transpose() * innovation));
+        let left = innovation - slopes * &change;
+        if left.norm() > EXPLAINED.max(0.3 * innovation.norm()) || innovation.norm() > FURTHEST {
+            return false;
+        }
+        for joint in 0..n {
+            self.covariance[(joint, joint)] += change[joint].powi(2);
+            self.covariance[(n + joint, n + joint)] += (change[joint] / 0.05).powi(2);
+        }
         true
     }
 
@@ -286,10 +338,17 @@ impl Filter {
         let Some(own) = (measurement.information + Matrix6::from_diagonal(&unseen)).try_inverse() else { return };
         let noise = own + Matrix6::from_diagonal(&shared.map(|s| s * s));
         let spread = SMatrix::<f64, 6, 6>::from_iterator((&jacobian * &self.covariance * jacobian.transpose()).iter().copied()) + noise;
-        let Some(inverse) = spread.try_inverse() else { return };
+        let Some(mut inverse) = spread.try_inverse() else { return };
         let innovation = SVector::<f64, 6>::from(-residual);
         if innovation.dot(&(inverse * innovation)) > GATE {
-            return;
+            for joint in mechanism.chain(body) {
+                let reach = reach(&mechanism, joint);
+                self.covariance[(joint, joint)] += (0.01 / reach).powi(2);
+                self.covariance[(n + joint, n + joint)] += (0.05 / reach).powi(2);
+            }
+            let spread = SMatrix::<f64, 6, 6>::from_iterator((&jacobian * &self.covariance * jacobian.transpose()).iter().copied()) + noise;
+            let Some(wider) = spread.try_inverse() else { return };
+            inverse = wider;
         }
         let inverse = DMatrix::from_column_slice(6, 6, inverse.as_slice());
         self.correct(&jacobian, &inverse, &DVector::from_column_slice(innovation.as_slice()));
@@ -313,6 +372,14 @@ impl Filter {
         for i in 0..self.covariance.nrows() {
             self.covariance[(i, i)] = self.covariance[(i, i)].max(0.0);
         }
+    }
+}
+
+/// Puts resting joints back.
+pub(super) fn keep(resting: &[(usize, f64)], state: &mut State<f64>) {
+    for &(joint, position) in resting {
+        state.positions[joint] = position;
+        state.rates[joint] = 0.0;
     }
 }
 

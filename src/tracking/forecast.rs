@@ -5,10 +5,10 @@
 
 use nalgebra::{DMatrix, Matrix3, Vector3};
 
-use super::filter::{FORCE_DENSITY, Filter, STEP, reach};
+use super::filter::{FORCE_DENSITY, Filter, STEP, keep, reach};
 use super::mechanism::TrackedMechanism;
 use crate::math::{Pose, Screw};
-use crate::mechanism::{State, Tree, WrenchPoint, WrenchSample, WrenchTrack, rollout};
+use crate::mechanism::{State, Step, Tree, WrenchPoint, WrenchSample, WrenchTrack, Workspace, step};
 use crate::model::{Axis, KinematicJoint};
 use crate::types::Label;
 
@@ -42,6 +42,7 @@ impl Filter {
         let first = samples.partition_point(|s| s.stamp_s < self.time_s - 0.05);
         let last = times_s.last().map_or(0, |end| samples.partition_point(|s| s.stamp_s <= end + 1e-9));
         let samples = &samples[first..last.max(first)];
+        let resting = self.resting();
         let simulate = |tree: &Tree<f64>, state: &State<f64>, step_s: f64| -> Option<Vec<Vec<f64>>> {
             if self.rests() {
                 return Some(vec![state.positions.clone(); times_s.len()]);
@@ -50,8 +51,22 @@ impl Filter {
                 point: WrenchPoint::Carried(held.point),
                 ..WrenchTrack::new(held.body, samples)
             });
-            let trajectory = rollout(tree, state, track.as_slice(), &times_s, step_s).ok()?;
-            Some((0..times_s.len()).map(|i| trajectory.positions(i).to_vec()).collect())
+            let mut workspace = Workspace::new(tree);
+            let mut state = state.clone();
+            let mut cursor = 0;
+            let mut path = vec![state.positions.clone()];
+            for span in times_s.windows(2) {
+                let count = ((span[1] - span[0]) / step_s - 1e-6).ceil().max(1.0) as usize;
+                let length_s = (span[1] - span[0]) / count as f64;
+                for i in 0..count {
+                    let middle_s = span[0] + (i as f64 + 0.5) * length_s;
+                    let wrench = track.as_ref().map(|track| track.wrench(middle_s, &mut cursor));
+                    step(tree, &mut state, wrench.as_slice(), Step { middle_s, length_s }, &mut workspace);
+                    keep(&resting, &mut state);
+                }
+                path.push(state.positions.clone());
+            }
+            path.iter().flatten().all(|q| q.is_finite()).then_some(path)
         };
         let tree = &self.mechanism.tree;
         let stay = || vec![self.state.positions.clone(); times_s.len()];
@@ -123,7 +138,7 @@ impl Filter {
     /// Variance of a joint's position by the unmodelled force over a span: ∫∫ of white acceleration.
     fn unmodelled(&self, joint: usize, span_s: f64) -> f64 {
         let inertia = self.inertia(joint);
-        let density = FORCE_DENSITY * self.mechanism.noise_scale * reach(&self.mechanism, joint).powi(2) / inertia.powi(2);
+        let density = FORCE_DENSITY * self.mechanism.noise_scale * self.unease * reach(&self.mechanism, joint).powi(2) / inertia.powi(2);
         density * span_s.powi(3) / 3.0
     }
 }
