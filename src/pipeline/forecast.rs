@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::explain::{measure, travel};
+use super::explain::{FEWEST_POINTS, measure, travel};
 use super::{Frame, Learner, Output, nearest_label};
 use crate::math::Pose;
 use crate::mechanism::WrenchSample;
@@ -107,7 +107,7 @@ pub(super) struct Forecaster {
     waiting: Vec<Waiting>,
     seen: VecDeque<Seen>,
     labels: BTreeSet<Label>,
-    places: BTreeMap<Label, Pose>,
+    places: BTreeMap<Label, FreePart>,
     pending: VecDeque<Pending>,
     root: Option<Label>,
 }
@@ -232,7 +232,7 @@ impl Forecaster {
     fn restart(&mut self, now_s: f64, learner: Option<&Learner>) -> bool {
         let Some(at) = self.waiting.iter().rposition(|waiting| waiting.from_s <= now_s + 1e-9) else { return false };
         let Some(new) = self.waiting.drain(..=at).next_back() else { return false };
-        self.places = new.displacements;
+        self.places = new.displacements.into_iter().map(|(label, place)| (label, FreePart::resting(place))).collect();
         self.denials = 0;
         let Some(mechanism) = new.mechanism else {
             self.filter = None;
@@ -293,7 +293,7 @@ impl Forecaster {
                     begins = true;
                     contact.label = most;
                     contact.track.clear();
-                    contact.from = most.and_then(|l| self.places.get(&l)).copied().unwrap_or_else(Pose::identity);
+                    contact.from = most.and_then(|l| self.places.get(&l)).map_or_else(Pose::identity, |place| place.displacement);
                 }
             }
             contact.track.push((sample.stamp_s, sample.point_in_world));
@@ -312,7 +312,7 @@ impl Forecaster {
         let Some(contact) = self.contact.take() else { return };
         if let Some(label) = contact.label {
             let end = FreePart::carried(contact.from, &contact.track);
-            self.places.insert(label, end.displacement);
+            self.places.insert(label, FreePart { velocity: None, ..end });
         }
     }
 
@@ -321,9 +321,9 @@ impl Forecaster {
         self.labels
             .iter()
             .map(|label| {
-                let place = self.places.get(label).copied().unwrap_or_else(Pose::identity);
+                let place = || self.places.get(label).cloned().unwrap_or_else(|| FreePart::resting(Pose::identity()));
                 let held = self.contact.as_ref().filter(|contact| self.use_tool && contact.label == Some(*label));
-                let part = held.map_or_else(|| FreePart::resting(place), |contact| FreePart::carried(contact.from, &contact.track));
+                let part = held.map_or_else(place, |contact| FreePart::carried(contact.from, &contact.track));
                 (*label, part)
             })
             .collect()
@@ -403,14 +403,17 @@ fn follow(filter: &mut Filter, seen: &Seen, samples: &[WrenchSample], learner: O
     let (mut measured, mut still) = (BTreeMap::new(), true);
     let settings = AlignmentSettings { gate: POSE_GATE, ..AlignmentSettings::default() };
     for (label, displacement) in filter.moving_parts() {
-        if let (Some(model), Some(scan)) = (learner.models.get(&label), seen.frame.scans.get(&label))
-            && let Some(measurement) = measure(model, scan, &displacement, &settings)
-        {
-            filter.correct_by_pose(label, &measurement);
-            let (before, after) = (last.get(&label), measurement.displacement);
-            still &= before.is_some_and(|before| travel(model, before, &after) < STILL);
-            measured.insert(label, after);
-        }
+        let (Some(model), Some(scan)) = (learner.models.get(&label), seen.frame.scans.get(&label)) else { continue };
+        let Some(measurement) = measure(model, scan, &displacement, &settings) else {
+            if scan.len() >= FEWEST_POINTS {
+                filter.lose(label);
+            }
+            continue;
+        };
+        filter.correct_by_pose(label, &measurement);
+        let (before, after) = (last.get(&label), measurement.displacement);
+        still &= before.is_some_and(|before| travel(model, before, &after) < STILL);
+        measured.insert(label, after);
     }
     if filter.held().is_none() && !measured.is_empty() && still {
         filter.rest();

@@ -61,6 +61,8 @@ pub struct Filter {
     pub(super) unease: f64,
     /// Running mean of the tool's squared innovations in units of their variance.
     surprise: f64,
+    /// Positions at the start.
+    start: Vec<f64>,
     cursor: usize,
 }
 
@@ -83,8 +85,9 @@ impl Filter {
             covariance[(n + joint, n + joint)] = if rates[joint] == 0.0 { 0.0 } else { (rate_deviation / reach).powi(2) };
         }
         let workspace = Workspace::new(&mechanism.tree);
+        let start = positions.clone();
         let state = State::new(positions, rates);
-        Self { mechanism, time_s, state, covariance, held: None, workspace, inertias, unease: 1.0, surprise: 1.0, cursor: 0 }
+        Self { start, mechanism, time_s, state, covariance, held: None, workspace, inertias, unease: 1.0, surprise: 1.0, cursor: 0 }
     }
 
     /// What it filters.
@@ -118,6 +121,16 @@ impl Filter {
         let driven = self.held.map(|held| self.mechanism.chain(held.body)).unwrap_or_default();
         let rests = |joint: &usize| self.state.rates[*joint] == 0.0 && !driven.contains(joint);
         (0..self.mechanism.joints.len()).filter(rests).map(|joint| (joint, self.state.positions[joint])).collect()
+    }
+
+    /// A part that is not where it should be, with all that carries it, is where the filter started, at rest.
+    pub fn lose(&mut self, label: Label) {
+        let Some(body) = self.mechanism.body(label) else { return };
+        for joint in self.mechanism.chain(body) {
+            self.state.positions[joint] = self.start[joint];
+            self.state.rates[joint] = 0.0;
+        }
+        self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
     }
 
     /// Everything that nothing touches is at rest.

@@ -18,12 +18,14 @@ pub struct FreePart {
     pub displacement: Pose,
     /// Velocity of its points \[m/s\]; `None` at rest.
     pub velocity: Option<Vector3<f64>>,
+    /// How far the displacement may be off, where only the tool tells \[m\].
+    pub doubt_m: f64,
 }
 
 impl FreePart {
     /// Where it stays.
     pub fn resting(displacement: Pose) -> Self {
-        Self { displacement, velocity: None }
+        Self { displacement, velocity: None, doubt_m: 0.0 }
     }
 
     /// Where the tool carries it, by the tool's positions since it took hold: (time \[s\], point \[m\]).
@@ -38,17 +40,22 @@ impl FreePart {
             return Self::resting(held_from);
         }
         let slope = recent.iter().map(|(t, x)| (x - mean_x) * (t - last.0 - mean_t)).sum::<Vector3<f64>>() / square;
-        let now = mean_x - slope * mean_t;
-        Self { displacement: Pose::from_translation(now - first.1) * held_from, velocity: Some(slope) }
+        let went = mean_x - slope * mean_t - first.1;
+        // Its centre goes less than where it is held, if it turns.
+        Self {
+            displacement: Pose::from_translation(went) * held_from,
+            velocity: Some(slope),
+            doubt_m: 0.5 * went.norm(),
+        }
     }
 
     /// Its displacement after a horizon \[s\], and the covariance of its points \[m²\].
     pub fn after(&self, horizon_s: f64) -> (Pose, Matrix3<f64>) {
         match self.velocity {
-            None => (self.displacement, Matrix3::from_diagonal_element((RESTING.0 + RESTING.1 * horizon_s).powi(2))),
+            None => (self.displacement, Matrix3::from_diagonal_element((RESTING.0 + RESTING.1 * horizon_s + self.doubt_m).powi(2))),
             Some(velocity) => {
                 let half_speed = 0.5 * velocity.norm() * horizon_s;
-                let std = MOVING.0 + half_speed + 0.5 * MOVING.1 * horizon_s * horizon_s;
+                let std = MOVING.0 + self.doubt_m + half_speed + 0.5 * MOVING.1 * horizon_s * horizon_s;
                 (Pose::from_translation(velocity * horizon_s) * self.displacement, Matrix3::from_diagonal_element(std * std))
             }
         }
