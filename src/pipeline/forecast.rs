@@ -377,6 +377,9 @@ fn follow(filter: &mut Filter, seen: &Seen, samples: &[WrenchSample], learner: O
             filter.release();
             continue;
         };
+        if touch.begins {
+            filter.trust();
+        }
         if touch.begins || filter.held().is_none_or(|held| held.body != body) {
             *denials = 0;
             filter.hold(body, &touch.tool_in_world, seen.tool_sigma);
@@ -388,6 +391,8 @@ fn follow(filter: &mut Filter, seen: &Seen, samples: &[WrenchSample], learner: O
                 if *denials >= DENIALS {
                     *denials = 0;
                     if touch.pushes {
+                        // It is held, and not where the model has it: for now, it goes as the tool does.
+                        filter.distrust(body);
                         filter.hold(body, &touch.tool_in_world, seen.tool_sigma);
                     }
                 }

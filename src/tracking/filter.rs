@@ -61,6 +61,8 @@ pub struct Filter {
     pub(super) unease: f64,
     /// Running mean of the tool's squared innovations in units of their variance.
     surprise: f64,
+    /// Joints that what is held does not follow.
+    pub(super) distrusted: Vec<bool>,
     /// Positions at the start.
     start: Vec<f64>,
     cursor: usize,
@@ -87,7 +89,7 @@ impl Filter {
         let workspace = Workspace::new(&mechanism.tree);
         let start = positions.clone();
         let state = State::new(positions, rates);
-        Self { start, mechanism, time_s, state, covariance, held: None, workspace, inertias, unease: 1.0, surprise: 1.0, cursor: 0 }
+        Self { start, distrusted: vec![false; n], mechanism, time_s, state, covariance, held: None, workspace, inertias, unease: 1.0, surprise: 1.0, cursor: 0 }
     }
 
     /// What it filters.
@@ -131,6 +133,20 @@ impl Filter {
             self.state.rates[joint] = 0.0;
         }
         self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
+    }
+
+    /// What moves a body is not as the mechanism says: it stops, and is not forecast.
+    pub fn distrust(&mut self, body: usize) {
+        for joint in self.mechanism.chain(body) {
+            self.distrusted[joint] = true;
+            self.state.rates[joint] = 0.0;
+        }
+        self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
+    }
+
+    /// Every joint counts again.
+    pub fn trust(&mut self) {
+        self.distrusted.fill(false);
     }
 
     /// Everything that nothing touches is at rest.

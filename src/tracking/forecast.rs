@@ -117,6 +117,9 @@ impl Filter {
             let positions = &path[horizon + 1];
             let displacements = tree.displacements(positions);
             for (body, joint) in self.mechanism.joints.iter().enumerate() {
+                if self.mechanism.chain(body).iter().any(|&joint| self.distrusted[joint]) {
+                    continue;
+                }
                 let displacement = displacements[body];
                 let way = (displacement.transform_point(&self.mechanism.centers[body])
                     - tree.displacements(&path[0])[body].transform_point(&self.mechanism.centers[body]))

@@ -10,7 +10,8 @@ use rand_distr::{Distribution, StandardNormal};
 use super::innovations::WindowModel;
 use super::layout::{JointScales, Mechanism, SIZE, joint_models};
 use super::learner::{DynamicsInput, DynamicsLearner};
-use super::posterior::{DynamicsPosterior, Quantity};
+use super::posterior::DynamicsPosterior;
+use crate::types::posterior::Quantity;
 use super::track::{TrackKinematics, TrackSource, joint_track};
 use crate::geometry::HullProperties;
 use crate::math::{Pose, Screw};
@@ -46,7 +47,7 @@ fn joint(parent: Option<usize>, label: u32, axis: Option<(Vector3<f64>, Vector3<
         Some((direction, point)) => (JointType::Revolute, Axis { direction, point }),
         None => (JointType::Prismatic, Axis { direction: slide, point: Vector3::zeros() }),
     };
-    KinematicJoint { parent, child: Label(label), joint_type, axis, center: Vector3::new(0.2, 0.0, 0.0), radius: 0.2 }
+    KinematicJoint { parent, child: Label(label), joint_type, axis, center: Vector3::new(0.2, 0.0, 0.0), radius: 0.2, suggested: None }
 }
 
 fn body(joint: &KinematicJoint, mass: f64, com: Vector3<f64>, damping: f64, friction: f64) -> Body<f64> {
