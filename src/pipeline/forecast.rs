@@ -219,7 +219,9 @@ impl Forecaster {
         let free = self.free_parts();
         self.pending.push_back(Pending { time_s: now_s, filter: self.filter.clone(), free, root: self.root });
         let newest_s = self.samples.last().map_or(f64::NEG_INFINITY, |s| s.stamp_s);
-        outputs.extend(self.ready(|pending| newest_s >= pending.time_s + HORIZONS[2] || now_s > pending.time_s + HORIZONS[2] + PATIENCE));
+        outputs.extend(self.ready(|pending| {
+            newest_s >= pending.time_s + HORIZONS[2] || now_s > pending.time_s + HORIZONS[2] + PATIENCE
+        }));
         outputs
     }
 
@@ -293,7 +295,8 @@ impl Forecaster {
                     begins = true;
                     contact.label = most;
                     contact.track.clear();
-                    contact.from = most.and_then(|l| self.places.get(&l)).map_or_else(Pose::identity, |place| place.displacement);
+                    contact.from =
+                        most.and_then(|l| self.places.get(&l)).map_or_else(Pose::identity, |place| place.displacement);
                 }
             }
             contact.track.push((sample.stamp_s, sample.point_in_world));
@@ -351,23 +354,38 @@ impl Forecaster {
     }
 
     fn predict(&self, pending: &Pending, outputs: &mut Vec<Output>) {
-        let forecasts = pending.filter.as_ref().map(|filter| filter.forecast(&HORIZONS, &self.samples)).unwrap_or_default();
+        let forecasts =
+            pending.filter.as_ref().map(|filter| filter.forecast(&HORIZONS, &self.samples)).unwrap_or_default();
         for label in pending.free.keys() {
             for (horizon, horizon_s) in HORIZONS.into_iter().enumerate() {
                 let jointed = forecasts.iter().find(|f| f.label == *label && f.horizon == horizon);
                 let (displacement, covariance_m2) = match jointed {
-                    _ if pending.root == Some(*label) => (Pose::identity(), Matrix3::from_diagonal_element(ROOT_DEVIATION.powi(2))),
+                    _ if pending.root == Some(*label) => {
+                        (Pose::identity(), Matrix3::from_diagonal_element(ROOT_DEVIATION.powi(2)))
+                    }
                     Some(forecast) => (forecast.displacement, forecast.covariance_m2),
                     None => pending.free[label].after(horizon_s),
                 };
-                outputs.push(Output::Prediction { time_s: pending.time_s, horizon_s, label: *label, displacement, covariance_m2 });
+                outputs.push(Output::Prediction {
+                    time_s: pending.time_s,
+                    horizon_s,
+                    label: *label,
+                    displacement,
+                    covariance_m2,
+                });
             }
         }
     }
 }
 
 /// The filter through what one stamp brought.
-fn follow(filter: &mut Filter, seen: &Seen, samples: &[WrenchSample], learner: Option<&Learner>, (denials, last): (&mut usize, &mut BTreeMap<Label, Pose>)) {
+fn follow(
+    filter: &mut Filter,
+    seen: &Seen,
+    samples: &[WrenchSample],
+    learner: Option<&Learner>,
+    (denials, last): (&mut usize, &mut BTreeMap<Label, Pose>),
+) {
     let Some(learner) = learner else { return };
     let from_s = filter.time_s();
     for touch in seen.touches.iter().filter(|touch| touch.time_s > from_s) {

@@ -11,7 +11,7 @@ use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, SMatrix, SVector, Vector3, Ve
 
 use super::mechanism::TrackedMechanism;
 use crate::math::{Pose, skew};
-use crate::mechanism::{BodyWrench, Spatial, State, Step, WrenchPoint, WrenchSample, WrenchTrack, Workspace, step};
+use crate::mechanism::{BodyWrench, Spatial, State, Step, Workspace, WrenchPoint, WrenchSample, WrenchTrack, step};
 use crate::model::PoseMeasurement;
 use crate::types::Label;
 
@@ -84,12 +84,26 @@ impl Filter {
         for joint in 0..n {
             let reach = reach(&mechanism, joint);
             covariance[(joint, joint)] = (deviation / reach).powi(2);
-            covariance[(n + joint, n + joint)] = if rates[joint] == 0.0 { 0.0 } else { (rate_deviation / reach).powi(2) };
+            covariance[(n + joint, n + joint)] =
+                if rates[joint] == 0.0 { 0.0 } else { (rate_deviation / reach).powi(2) };
         }
         let workspace = Workspace::new(&mechanism.tree);
         let start = positions.clone();
         let state = State::new(positions, rates);
-        Self { start, distrusted: vec![false; n], mechanism, time_s, state, covariance, held: None, workspace, inertias, unease: 1.0, surprise: 1.0, cursor: 0 }
+        Self {
+            start,
+            distrusted: vec![false; n],
+            mechanism,
+            time_s,
+            state,
+            covariance,
+            held: None,
+            workspace,
+            inertias,
+            unease: 1.0,
+            surprise: 1.0,
+            cursor: 0,
+        }
     }
 
     /// What it filters.
@@ -250,7 +264,8 @@ impl Filter {
         for joint in 0..n {
             let stuck = self.state.rates[joint] == 0.0;
             let damping = self.mechanism.tree.bodies()[joint].parameters.damping;
-            let decay = if stuck { (-span / STUCK_MEMORY).exp() } else { 1.0 / (1.0 + span * damping / self.inertias[joint]) };
+            let decay =
+                if stuck { (-span / STUCK_MEMORY).exp() } else { 1.0 / (1.0 + span * damping / self.inertias[joint]) };
             // (q, q̇) ← (q + h q̇, α q̇)
             let shift = self.covariance.row(n + joint) * span;
             let mut row = self.covariance.row_mut(joint);
@@ -265,7 +280,8 @@ impl Filter {
                 None if stuck => 0.0,
                 None => reach(&self.mechanism, joint).powi(2),
             };
-            let density = FORCE_DENSITY * self.mechanism.noise_scale * self.unease * lever / self.inertias[joint].powi(2);
+            let density =
+                FORCE_DENSITY * self.mechanism.noise_scale * self.unease * lever / self.inertias[joint].powi(2);
             self.covariance[(n + joint, n + joint)] += density * span;
             self.covariance[(joint, joint)] += density * span.powi(3) / 3.0;
             self.covariance[(n + joint, joint)] += density * span.powi(2) / 2.0;
@@ -312,7 +328,9 @@ impl Filter {
         jacobian.view_mut((0, 0), (3, n)).copy_from(&self.point_slopes(&held));
         jacobian.view_mut((0, 2 * n), (3, 3)).copy_from(&displacement.rotation);
         let noise = Matrix3::identity() * (sigma_m * sigma_m + HELD_DEVIATION.powi(2));
-        let spread = SMatrix::<f64, 3, 3>::from_iterator((&jacobian * &self.covariance * jacobian.transpose()).iter().copied()) + noise;
+        let spread =
+            SMatrix::<f64, 3, 3>::from_iterator((&jacobian * &self.covariance * jacobian.transpose()).iter().copied())
+                + noise;
         let Some(inverse) = spread.try_inverse() else { return false };
         let squared = innovation.dot(&(inverse * innovation));
         let slopes = jacobian.view((0, 0), (3, n)).into_owned();
@@ -320,8 +338,14 @@ impl Filter {
             return false;
         }
         self.surprise += SURPRISE_SHARE * ((squared / 3.0).min(GATE) - self.surprise);
-        self.unease = if self.surprise > SURPRISED { (self.unease * 1.25).min(MOST_UNEASE) } else { (self.unease * 0.97).max(1.0) };
-        let spread = SMatrix::<f64, 3, 3>::from_iterator((&jacobian * &self.covariance * jacobian.transpose()).iter().copied()) + noise;
+        self.unease = if self.surprise > SURPRISED {
+            (self.unease * 1.25).min(MOST_UNEASE)
+        } else {
+            (self.unease * 0.97).max(1.0)
+        };
+        let spread =
+            SMatrix::<f64, 3, 3>::from_iterator((&jacobian * &self.covariance * jacobian.transpose()).iter().copied())
+                + noise;
         let Some(inverse) = spread.try_inverse() else { return false };
         let inverse = DMatrix::from_column_slice(3, 3, inverse.as_slice());
         self.correct(&jacobian, &inverse, &DVector::from_column_slice(innovation.as_slice()));
@@ -366,7 +390,9 @@ impl Filter {
         let unseen = Vector6::new(1.0, 1.0, 1.0, 1.0, 1.0, 1.0);
         let Some(own) = (measurement.information + Matrix6::from_diagonal(&unseen)).try_inverse() else { return };
         let noise = own + Matrix6::from_diagonal(&shared.map(|s| s * s));
-        let spread = SMatrix::<f64, 6, 6>::from_iterator((&jacobian * &self.covariance * jacobian.transpose()).iter().copied()) + noise;
+        let spread =
+            SMatrix::<f64, 6, 6>::from_iterator((&jacobian * &self.covariance * jacobian.transpose()).iter().copied())
+                + noise;
         let Some(mut inverse) = spread.try_inverse() else { return };
         let innovation = SVector::<f64, 6>::from(-residual);
         if innovation.dot(&(inverse * innovation)) > GATE {
@@ -375,7 +401,9 @@ impl Filter {
                 self.covariance[(joint, joint)] += (0.01 / reach).powi(2);
                 self.covariance[(n + joint, n + joint)] += (0.05 / reach).powi(2);
             }
-            let spread = SMatrix::<f64, 6, 6>::from_iterator((&jacobian * &self.covariance * jacobian.transpose()).iter().copied()) + noise;
+            let spread = SMatrix::<f64, 6, 6>::from_iterator(
+                (&jacobian * &self.covariance * jacobian.transpose()).iter().copied(),
+            ) + noise;
             let Some(wider) = spread.try_inverse() else { return };
             inverse = wider;
         }

@@ -52,11 +52,17 @@ impl FreePart {
     /// Its displacement after a horizon \[s\], and the covariance of its points \[m²\].
     pub fn after(&self, horizon_s: f64) -> (Pose, Matrix3<f64>) {
         match self.velocity {
-            None => (self.displacement, Matrix3::from_diagonal_element((RESTING.0 + RESTING.1 * horizon_s + self.doubt_m).powi(2))),
+            None => (
+                self.displacement,
+                Matrix3::from_diagonal_element((RESTING.0 + RESTING.1 * horizon_s + self.doubt_m).powi(2)),
+            ),
             Some(velocity) => {
                 let half_speed = 0.5 * velocity.norm() * horizon_s;
                 let std = MOVING.0 + self.doubt_m + half_speed + 0.5 * MOVING.1 * horizon_s * horizon_s;
-                (Pose::from_translation(velocity * horizon_s) * self.displacement, Matrix3::from_diagonal_element(std * std))
+                (
+                    Pose::from_translation(velocity * horizon_s) * self.displacement,
+                    Matrix3::from_diagonal_element(std * std),
+                )
             }
         }
     }

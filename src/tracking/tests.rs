@@ -46,7 +46,12 @@ fn readings() -> Vec<WrenchSample> {
         .map(|i| {
             let stamp_s = f64::from(i) * 0.008;
             let force_in_world = Vector3::x() * (7.0 * (2.5 * stamp_s).sin());
-            WrenchSample { stamp_s, point_in_world: Vector3::zeros(), force_in_world, torque_in_world: Vector3::zeros() }
+            WrenchSample {
+                stamp_s,
+                point_in_world: Vector3::zeros(),
+                force_in_world,
+                torque_in_world: Vector3::zeros(),
+            }
         })
         .collect()
 }
