@@ -13,7 +13,7 @@
 //! # Layers
 //! Each module may use those before it in this list, never those after it; `tests/layers.rs` is
 //! the wall: `math`, `types`, `geometry`, `registration`, `mechanism`, `structure`, `inference`,
-//! `model`, `pipeline`, `io`, `report`.
+//! `model`, `tracking`, `pipeline`, `io`, `report`.
 
 pub mod geometry;
 pub mod inference;
@@ -25,4 +25,5 @@ pub mod pipeline;
 pub mod registration;
 pub mod report;
 pub mod structure;
+pub mod tracking;
 pub mod types;

@@ -39,8 +39,7 @@ pub struct ReplayArguments {
     #[arg(long, value_name = "OUT.csv")]
     observations: Option<PathBuf>,
     /// Write where each part was expected, csv
-    // Hidden while the pipeline does not predict: asking for it is answered with a warning.
-    #[arg(long, value_name = "OUT.csv", hide = true)]
+    #[arg(long, value_name = "OUT.csv")]
     predictions: Option<PathBuf>,
 }
 
@@ -51,9 +50,6 @@ pub fn run(arguments: &ReplayArguments) -> anyhow::Result<()> {
         Some(path) => Config::from_file(path)?,
         None => Config::default(),
     };
-    if let Some(path) = &arguments.predictions {
-        tracing::warn!("--predictions {}: not written, as there is no prediction yet", path.display());
-    }
     let mut bag = Bag::open(&arguments.bag)?;
     let missing = MissingTopics::of(&config.input, bag.summary());
     if let Some(missing) = missing.as_ref().filter(|missing| missing.nothing_to_see) {
@@ -94,6 +90,7 @@ struct Replay {
     ingest: Ingest,
     pipeline: Pipeline,
     observations: Option<OutputFile>,
+    predictions: Option<OutputFile>,
     seen: BTreeSet<Label>,
     /// Earliest and latest stamp.
     span: Option<(Stamp, Stamp)>,
@@ -107,10 +104,17 @@ impl Replay {
         if let Some(file) = &mut observations {
             displacement_csv::write_header(&mut *file, false).map_err(|error| file.fail(error))?;
         }
+        let mut predictions = arguments.predictions.as_deref().map(OutputFile::create).transpose()?;
+        if let Some(file) = &mut predictions {
+            displacement_csv::write_header(&mut *file, true).map_err(|error| file.fail(error))?;
+        }
+        let mut settings = config.pipeline_settings(arguments.root_label.map(Label));
+        settings.predict = predictions.is_some();
         Ok(Self {
             ingest: Ingest::new(&config.input),
-            pipeline: Pipeline::new(config.pipeline_settings(arguments.root_label.map(Label))),
+            pipeline: Pipeline::new(settings),
             observations,
+            predictions,
             seen: BTreeSet::new(),
             span: None,
             inference_wall: Vec::new(),
@@ -165,6 +169,17 @@ impl Replay {
                 };
                 displacement_csv::write_row(&mut *file, &row).map_err(|error| file.fail(error))?;
             }
+            Output::Prediction { time_s, horizon_s, label, displacement, covariance_m2 } => {
+                let Some(file) = &mut self.predictions else { return Ok(()) };
+                let row = Row {
+                    time_s: *time_s,
+                    horizon_s: Some(*horizon_s),
+                    label: *label,
+                    displacement: *displacement,
+                    std_m: covariance_m2.diagonal().map(|variance| variance.max(0.0).sqrt()),
+                };
+                displacement_csv::write_row(&mut *file, &row).map_err(|error| file.fail(error))?;
+            }
             Output::Learned { span_s } => tracing::info!(from_s = span_s.0, to_s = span_s.1, "window learned"),
         }
         Ok(())
@@ -189,7 +204,7 @@ impl Replay {
     }
 
     fn finish_files(&mut self) -> anyhow::Result<()> {
-        if let Some(file) = self.observations.take() {
+        for file in [self.observations.take(), self.predictions.take()].into_iter().flatten() {
             file.finish()?;
         }
         Ok(())

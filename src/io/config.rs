@@ -82,6 +82,8 @@ impl Config {
             windows: self.windows,
             kinematics: self.kinematics,
             gravity_in_world: self.gravity_m_s2.into(),
+            predict: false,
+            posterior_latency_s: self.posterior_latency_s,
         }
     }
 

@@ -1,6 +1,7 @@
 //! The one state machine that the node and the replay share.
 
 mod explain;
+mod forecast;
 mod learner;
 mod posterior;
 mod windows;
@@ -8,7 +9,7 @@ mod working_frame;
 
 use std::collections::BTreeMap;
 
-use nalgebra::{Matrix6, Vector3, Vector6};
+use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
 pub use explain::Frame;
 pub use learner::{Learner, ParentEvidence, WindowJob};
@@ -18,6 +19,7 @@ use crate::math::Pose;
 use crate::model::{DynamicsLearner, KinematicSettings, PoseMeasurement};
 use crate::registration::{AlignmentSettings, Quadratic, SurfelAccumulator, align, truncated_cost};
 use crate::types::{Input, Label, Stamp};
+use forecast::Forecaster;
 use explain::{FEWEST_POINTS, measurement_of, travel};
 use windows::frame_of;
 use working_frame::WorkingFrame;
@@ -40,6 +42,10 @@ pub struct PipelineSettings {
     pub kinematics: KinematicSettings,
     /// Gravity in world \[m/s²\].
     pub gravity_in_world: Vector3<f64>,
+    /// Whether to predict.
+    pub predict: bool,
+    /// For prediction, a posterior counts from its window's close plus this \[s\].
+    pub posterior_latency_s: f64,
 }
 
 /// What the pipeline says.
@@ -53,6 +59,19 @@ pub enum Output {
         label: Label,
         /// Its displacement and information.
         measurement: PoseMeasurement,
+    },
+    /// Where a part was expected, of what was known at a stamp and the wrench after it.
+    Prediction {
+        /// The stamp, in seconds since time zero.
+        time_s: f64,
+        /// How far ahead of it \[s\].
+        horizon_s: f64,
+        /// The part.
+        label: Label,
+        /// Its displacement since the first frame.
+        displacement: Pose,
+        /// Covariance of its centre of mass, held fixed in the part \[m²\].
+        covariance_m2: Matrix3<f64>,
     },
     /// A window was learned.
     Learned {
@@ -75,12 +94,16 @@ pub struct Pipeline {
     current: BTreeMap<Label, Pose>,
     recent: Vec<BTreeMap<Label, Pose>>,
     moving: bool,
+    forecaster: Option<Forecaster>,
 }
 
 impl Pipeline {
     /// A pipeline that has seen nothing.
     pub fn new(settings: PipelineSettings) -> Self {
+        let forecaster =
+            settings.predict.then(|| Forecaster::new(settings.root, settings.use_tool, settings.posterior_latency_s));
         Self {
+            forecaster,
             settings,
             working_frame: WorkingFrame::Open(Vec::new()),
             zero: None,
@@ -109,11 +132,15 @@ impl Pipeline {
                 ready.into_iter().flat_map(|(stamp, clouds)| self.push_frame(stamp, &clouds)).collect()
             }
             other => {
+                let predictions = match (&mut self.forecaster, &other) {
+                    (Some(forecaster), Input::Wrench(wrench)) => forecaster.push_wrench(wrench),
+                    _ => Vec::new(),
+                };
                 match (&mut self.cutter, other) {
                     (Some(cutter), Input::Wrench(wrench)) => cutter.push_wrench(wrench),
                     (_, other) => self.early.push(other),
                 }
-                Vec::new()
+                predictions
             }
         }
     }
@@ -126,6 +153,7 @@ impl Pipeline {
         }
         let job = self.cutter.as_mut().and_then(|c| c.flush(nearest_label));
         outputs.extend(job.map(|job| self.learn(&job)));
+        outputs.extend(self.forecaster.iter_mut().flat_map(Forecaster::finish));
         outputs
     }
 
@@ -142,6 +170,7 @@ impl Pipeline {
         let frame = frame_of(stamp.seconds_since(zero), clouds);
         let mut outputs = self.observe(&frame);
         let moving = self.moving;
+        let seen = self.forecaster.is_some().then(|| frame.clone());
         if !self.cutter.as_ref().is_some_and(WindowCutter::is_open) && self.learner.is_none() {
             self.reference.push(frame.clone());
         }
@@ -149,7 +178,15 @@ impl Pipeline {
         if self.learner.is_none() && self.cutter.as_ref().is_some_and(WindowCutter::is_open) {
             self.open_reference();
         }
+        let closed = job.is_some();
         outputs.extend(job.map(|job| self.learn(&job)));
+        if let (Some(forecaster), Some(frame)) = (&mut self.forecaster, seen) {
+            if let Some(learner) = self.learner.as_ref().filter(|_| closed) {
+                forecaster.learned(learner);
+            }
+            let rest_force = self.cutter.as_ref().and_then(|cutter| cutter.rest_force).unwrap_or_default();
+            outputs.extend(forecaster.push_frame(frame, self.learner.as_ref(), zero, rest_force));
+        }
         outputs
     }
 

@@ -132,6 +132,11 @@ fn carried_output(output: Output, world_from_work: &Pose) -> Output {
             let information = turned(&measurement.information, &world_from_work.rotation);
             Output::Observation { time_s, label, measurement: PoseMeasurement { displacement, information } }
         }
+        Output::Prediction { time_s, horizon_s, label, displacement, covariance_m2 } => {
+            let displacement = *world_from_work * displacement * world_from_work.inverse();
+            let covariance_m2 = world_from_work.rotation * covariance_m2 * world_from_work.rotation.transpose();
+            Output::Prediction { time_s, horizon_s, label, displacement, covariance_m2 }
+        }
         Output::Learned { span_s } => Output::Learned { span_s },
     }
 }

@@ -1,0 +1,17 @@
+//! Where every part is and will be: a filter over the joints of the likeliest tree, and simulation.
+//!
+//! What is learned of a part decides how it is predicted. Nothing: constant velocity, shrunk to rest
+//! where nothing touches it ([`FreePart`]). A joint: the filter's position and rate, simulated on under
+//! the applied wrench at the carried contact point ([`Filter`], [`Filter::forecast`]).
+
+mod filter;
+mod forecast;
+mod free;
+mod mechanism;
+#[cfg(test)]
+mod tests;
+
+pub use filter::{Filter, Held};
+pub use forecast::{Forecast, Snapshot};
+pub use free::FreePart;
+pub use mechanism::TrackedMechanism;

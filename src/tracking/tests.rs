@@ -1,0 +1,126 @@
+//! The filter on simulated tracks.
+#![allow(clippy::unwrap_used)]
+
+use std::sync::Arc;
+
+use nalgebra::{DMatrix, Vector3};
+
+use super::{Filter, TrackedMechanism};
+use crate::math::Pose;
+use crate::mechanism::{
+    Body, JointParameters, JointType, State, Tree, WrenchPoint, WrenchSample, WrenchTrack, rollout,
+};
+use crate::model::{Axis, KinematicJoint};
+use crate::types::Label;
+
+const CONTACT: Vector3<f64> = Vector3::new(0.5, 0.0, 0.2);
+
+/// A drawer along x of 3 kg.
+fn drawer(damping: f64) -> TrackedMechanism {
+    let parameters = JointParameters::new(damping, 3.0);
+    let body = Body { parameters, ..Body::prismatic(None, &Vector3::x(), 3.0) };
+    let axis = Axis { direction: Vector3::x(), point: Vector3::zeros() };
+    let joint = KinematicJoint {
+        parent: None,
+        child: Label(4),
+        joint_type: JointType::Prismatic,
+        axis,
+        center: Vector3::zeros(),
+        radius: 0.2,
+        suggested: None,
+    };
+    TrackedMechanism {
+        joints: vec![joint],
+        tree: Tree::new(vec![body], Vector3::new(0.0, 0.0, -9.81)).unwrap(),
+        varied: vec![Vec::new()],
+        axis_roots: vec![DMatrix::zeros(2, 2)],
+        centers: vec![Vector3::zeros()],
+        tool_offset: Vector3::new(0.002, -0.001, 0.0),
+        noise_scale: 1.0,
+    }
+}
+
+/// Readings at 125 Hz of a pull that varies, with no noise: a test needs no luck.
+fn readings() -> Vec<WrenchSample> {
+    (0..250)
+        .map(|i| {
+            let stamp_s = f64::from(i) * 0.008;
+            let force_in_world = Vector3::x() * (7.0 * (2.5 * stamp_s).sin());
+            WrenchSample {
+                stamp_s,
+                point_in_world: Vector3::zeros(),
+                force_in_world,
+                torque_in_world: Vector3::zeros(),
+            }
+        })
+        .collect()
+}
+
+fn truth(tree: &Tree<f64>, samples: &[WrenchSample], times_s: &[f64]) -> Vec<(f64, f64)> {
+    let track = WrenchTrack { point: WrenchPoint::Carried(CONTACT), ..WrenchTrack::new(0, samples) };
+    let path = rollout(tree, &State::at_rest(1), &[track], times_s, 0.001).unwrap();
+    (0..times_s.len()).map(|i| (path.positions(i)[0], path.rates(i)[0])).collect()
+}
+
+/// The filter of `mechanism` at .8 s, fed by the motion of a drawer with damping 8 N·s/m, and where the
+/// drawer then is and goes.
+fn filtered(mechanism: TrackedMechanism) -> (Filter, Vec<(f64, f64)>) {
+    let real = drawer(8.0);
+    let samples = readings();
+    let times_s: Vec<f64> = (0..=100).map(|i| f64::from(i) * 0.008).collect();
+    let path = truth(&real.tree, &samples, &times_s);
+    let offset = mechanism.tool_offset;
+    let tool = |q: f64| CONTACT + Vector3::x() * q + offset;
+    let mut filter = Filter::new(Arc::new(mechanism), 0.0, vec![0.0], vec![0.0], (0.001, 0.01));
+    filter.hold(0, &tool(0.0), 0.001);
+    for (time_s, (q, _)) in times_s.iter().zip(&path).skip(1) {
+        filter.advance(*time_s, &samples);
+        assert!(filter.correct_by_tool(&tool(*q), 0.001));
+    }
+    let ahead = truth(&real.tree, &samples, &[0.0, 0.8, 0.9, 1.3]);
+    (filter, ahead)
+}
+
+#[test]
+fn a_simulated_track_is_recovered_and_predicted() {
+    let (filter, ahead) = filtered(drawer(8.0));
+    assert!((filter.positions()[0] - ahead[1].0).abs() < 5e-4, "{filter:?} {ahead:?}");
+    assert!((filter.rates()[0] - ahead[1].1).abs() < 5e-3);
+    for forecast in filter.forecast(&[0.1, 0.5], &readings()) {
+        let error = forecast.displacement.translation.x - ahead[2 + forecast.horizon].0;
+        assert!(error.abs() < 1e-3, "{error} m at horizon {}", forecast.horizon);
+        assert!(error.abs() < 2.0 * forecast.covariance_m2[(0, 0)].sqrt());
+        assert_eq!(forecast.label, Label(4));
+    }
+}
+
+#[test]
+fn a_wrong_model_still_follows_the_tool() {
+    let (filter, ahead) = filtered(drawer(20.0));
+    assert!((filter.positions()[0] - ahead[1].0).abs() < 3e-3);
+    assert!((filter.rates()[0] - ahead[1].1).abs() < 0.05);
+}
+
+#[test]
+fn what_rests_stays_exactly() {
+    let mut filter = Filter::new(Arc::new(drawer(8.0)), 0.0, vec![0.12], vec![0.0], (0.001, 0.01));
+    filter.advance(10.0, &readings());
+    assert!(filter.rests() && filter.positions() == [0.12]);
+    for forecast in filter.forecast(&[0.1, 0.5, 1.0], &readings()) {
+        assert_eq!(forecast.displacement, Pose::from_translation(Vector3::x() * 0.12));
+        assert!(forecast.covariance_m2[(0, 0)].sqrt() < 0.002);
+    }
+    // Held by less than friction: it sticks.
+    let weak: Vec<WrenchSample> =
+        readings().iter().map(|s| WrenchSample { force_in_world: s.force_in_world * 0.3, ..*s }).collect();
+    let mut filter = Filter::new(Arc::new(drawer(8.0)), 0.0, vec![0.12], vec![0.0], (0.001, 0.01));
+    filter.hold_point(0, CONTACT, 0.001);
+    filter.advance(1.0, &weak);
+    assert_eq!(filter.positions(), [0.12]);
+}
+
+#[test]
+fn the_same_input_gives_the_same_bits() {
+    let run = || filtered(drawer(8.0)).0.forecast(&[0.1, 0.5, 1.0], &readings());
+    assert_eq!(run(), run());
+}
