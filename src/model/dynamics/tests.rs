@@ -10,7 +10,8 @@ use rand_distr::{Distribution, StandardNormal};
 use super::innovations::WindowModel;
 use super::layout::{JointScales, Mechanism, SIZE, joint_models};
 use super::learner::{DynamicsInput, DynamicsLearner};
-use super::posterior::{DynamicsPosterior, Quantity};
+use super::posterior::DynamicsPosterior;
+use crate::types::posterior::Quantity;
 use super::track::{TrackKinematics, TrackSource, joint_track};
 use crate::geometry::HullProperties;
 use crate::math::{Pose, Screw};
@@ -66,6 +67,7 @@ fn joint(
         axis,
         center: Vector3::new(0.2, 0.0, 0.0),
         radius: 0.2,
+        suggested: None,
     }
 }
 
