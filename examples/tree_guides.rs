@@ -52,22 +52,14 @@ impl Table {
                 (tree, log_density)
             })
             .collect();
-        let log_evidence = log_densities
-            .values()
-            .map(|value| value.exp())
-            .sum::<f64>()
-            .ln();
-        Self {
-            log_densities,
-            log_evidence,
-        }
+        let log_evidence = log_densities.values().map(|value| value.exp()).sum::<f64>().ln();
+        Self { log_densities, log_evidence }
     }
 
     /// KL(q ‖ p), exact where the guide has a density, else from a histogram with the bias of
     /// Miller and Madow (seen − 1) / (2 draws) taken off.
     fn divergence(&self, guide: &dyn TreeGuide, rng: &mut ChaCha8Rng) -> f64 {
-        let log_ratio =
-            |tree: &Tree, log_prob: f64| log_prob - self.log_density(tree) + self.log_evidence;
+        let log_ratio = |tree: &Tree, log_prob: f64| log_prob - self.log_density(tree) + self.log_evidence;
         if guide.log_prob(&Tree::star(guide.part_count())).is_some() {
             let trees = self.log_densities.keys();
             return trees
@@ -94,10 +86,7 @@ impl Table {
 
 impl TreeTarget for Table {
     fn log_density(&self, tree: &Tree) -> f64 {
-        self.log_densities
-            .get(tree)
-            .copied()
-            .unwrap_or(f64::NEG_INFINITY)
+        self.log_densities.get(tree).copied().unwrap_or(f64::NEG_INFINITY)
     }
 }
 
@@ -108,11 +97,7 @@ fn enumerated(part_count: usize) -> Box<dyn TreeGuide> {
 }
 
 fn sampled(part_count: usize) -> Box<dyn TreeGuide> {
-    Box::new(MatrixTreeGuide {
-        enumerate_up_to: 0,
-        rate: 0.5,
-        ..MatrixTreeGuide::uniform(part_count)
-    })
+    Box::new(MatrixTreeGuide { enumerate_up_to: 0, rate: 0.5, ..MatrixTreeGuide::uniform(part_count) })
 }
 
 fn gumbel(part_count: usize) -> Box<dyn TreeGuide> {
@@ -126,11 +111,7 @@ fn gumbel_cold(part_count: usize) -> Box<dyn TreeGuide> {
 }
 
 fn compare(part_count: usize, interaction_spread: f64) -> Result<()> {
-    let label = if interaction_spread > 0.0 {
-        "edges + interactions"
-    } else {
-        "sum over edges"
-    };
+    let label = if interaction_spread > 0.0 { "edges + interactions" } else { "sum over edges" };
     let guides: [(&str, MakeGuide, &[u32]); 4] = [
         ("matrix-tree, all trees", enumerated, &[0, 1, 3, 10]),
         ("matrix-tree, 16 N² draws", sampled, &[1, 3, 10, 30]),
@@ -159,9 +140,7 @@ fn compare(part_count: usize, interaction_spread: f64) -> Result<()> {
         }
         for ((steps, divergence), time) in checkpoints.iter().zip(divergences).zip(times) {
             let milliseconds = time.as_secs_f64() * 1e3;
-            println!(
-                "| {part_count} | {label} | {name} | {steps} | {divergence:.2e} | {milliseconds:.1} |"
-            );
+            println!("| {part_count} | {label} | {name} | {steps} | {divergence:.2e} | {milliseconds:.1} |");
         }
     }
     Ok(())

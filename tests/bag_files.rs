@@ -16,27 +16,13 @@ type Content = (String, u64, Vec<u8>);
 /// 200 messages on two topics that a compressor cannot make nothing of, in the order of log times.
 fn contents() -> Vec<Content> {
     let topics = ["/a", "/b"];
-    let bytes = |index: u64| {
-        (0..100)
-            .map(|byte| (index * index + 7 * byte) as u8)
-            .collect()
-    };
-    (0..200)
-        .map(|index| {
-            (
-                topics[index as usize % 2].to_owned(),
-                1000 * index,
-                bytes(index),
-            )
-        })
-        .collect()
+    let bytes = |index: u64| (0..100).map(|byte| (index * index + 7 * byte) as u8).collect();
+    (0..200).map(|index| (topics[index as usize % 2].to_owned(), 1000 * index, bytes(index))).collect()
 }
 
 fn write_bag(path: &Path, contents: &[Content], compression: Compression, chunk_size: Option<u64>) {
     let mut writer = BagWriter::create_with(path, compression, chunk_size).unwrap();
-    let a = writer
-        .add_topic("/a", "geometry_msgs/msg/WrenchStamped")
-        .unwrap();
+    let a = writer.add_topic("/a", "geometry_msgs/msg/WrenchStamped").unwrap();
     let b = writer.add_topic("/b", "tf2_msgs/msg/TFMessage").unwrap();
     for (topic, time, bytes) in contents {
         let id = if topic == "/a" { a } else { b };
@@ -46,14 +32,7 @@ fn write_bag(path: &Path, contents: &[Content], compression: Compression, chunk_
 }
 
 fn read(bag: &mut Bag) -> Vec<Content> {
-    bag.map(|message| {
-        (
-            message.topic.name.clone(),
-            message.log_time_ns,
-            message.bytes().to_vec(),
-        )
-    })
-    .collect()
+    bag.map(|message| (message.topic.name.clone(), message.log_time_ns, message.bytes().to_vec())).collect()
 }
 
 fn read_whole(path: &Path) -> Vec<Content> {
@@ -91,26 +70,12 @@ fn chunks_of_every_compression_and_no_chunks_read_alike() {
     for compression in [Compression::None, Compression::Lz4, Compression::Zstd] {
         for chunk_size in [None, Some(500), Some(1 << 20)] {
             write_bag(&path, &contents(), compression, chunk_size);
-            assert_eq!(
-                read_whole(&path),
-                contents(),
-                "{compression:?} {chunk_size:?}"
-            );
+            assert_eq!(read_whole(&path), contents(), "{compression:?} {chunk_size:?}");
         }
     }
     let summary = Bag::open(&path).unwrap().summary().clone();
-    let topics: Vec<_> = summary
-        .topics
-        .iter()
-        .map(|(topic, n)| (&*topic.name, &*topic.type_name, *n))
-        .collect();
-    assert_eq!(
-        topics,
-        [
-            ("/a", "geometry_msgs/msg/WrenchStamped", 100),
-            ("/b", "tf2_msgs/msg/TFMessage", 100)
-        ]
-    );
+    let topics: Vec<_> = summary.topics.iter().map(|(topic, n)| (&*topic.name, &*topic.type_name, *n)).collect();
+    assert_eq!(topics, [("/a", "geometry_msgs/msg/WrenchStamped", 100), ("/b", "tf2_msgs/msg/TFMessage", 100)]);
 }
 
 #[test]
@@ -151,11 +116,7 @@ fn rosbag2_folders_split_compressed_or_without_metadata_read_alike() {
     assert_eq!(read_whole(folder.path()), all);
     assert_eq!(read_whole(&folder.path().join("x_0.mcap.zstd")), first);
     write_metadata(folder.path(), "file", "x_0.mcap, x_1.mcap");
-    assert_eq!(
-        read_whole(folder.path()),
-        all,
-        "metadata may name the files without .zstd"
-    );
+    assert_eq!(read_whole(folder.path()), all, "metadata may name the files without .zstd");
 
     let folder = split(["x_2.mcap", "x_10.mcap"], false);
     assert_eq!(read_whole(folder.path()), all, "no metadata");
@@ -168,12 +129,7 @@ fn messages_compressed_one_by_one_are_unpacked() {
         .into_iter()
         .map(|(topic, time, bytes)| (topic, time, zstd::encode_all(&*bytes, 1).unwrap()))
         .collect();
-    write_bag(
-        &folder.path().join("x.mcap"),
-        &packed,
-        Compression::None,
-        None,
-    );
+    write_bag(&folder.path().join("x.mcap"), &packed, Compression::None, None);
     write_metadata(folder.path(), "message", "x.mcap");
     assert_eq!(read_whole(folder.path()), contents());
 }
@@ -183,19 +139,9 @@ fn what_is_no_bag_is_refused_by_name() {
     let folder = folder();
     let refusal = |path: &Path| Bag::open(path).map(|_| ()).unwrap_err().to_string();
     let missing = folder.path().join("missing.mcap");
-    assert_eq!(
-        refusal(&missing),
-        format!(
-            "{}: No such file or directory (os error 2)",
-            missing.display()
-        )
-    );
+    assert_eq!(refusal(&missing), format!("{}: No such file or directory (os error 2)", missing.display()));
     assert!(refusal(folder.path()).ends_with("no metadata.yaml and no .mcap file in this folder"));
-    for (length, content) in [
-        (0, &b""[..]),
-        (5, b"hello"),
-        (20, b"SQLite format 3\0\0\0\0\0"),
-    ] {
+    for (length, content) in [(0, &b""[..]), (5, b"hello"), (20, b"SQLite format 3\0\0\0\0\0")] {
         let path = folder.path().join("other.mcap");
         fs::write(&path, content).unwrap();
         assert!(refusal(&path).contains(&format!("other.mcap: not an MCAP file ({length} bytes")));
@@ -208,37 +154,19 @@ fn what_is_no_bag_is_refused_by_name() {
             "rosbag2_bagfile_information: {storage_identifier: sqlite3}",
             "storage_identifier is `sqlite3`, expected mcap",
         ),
-        (
-            "rosbag2_bagfile_information: {compression_format: bz2}",
-            "compression_format is `bz2`",
-        ),
-        (
-            "rosbag2_bagfile_information: {}",
-            "relative_file_paths is missing or empty",
-        ),
-        (
-            "rosbag2_bagfile_information: {relative_file_paths: [gone.mcap]}",
-            "gone.mcap: No such file",
-        ),
+        ("rosbag2_bagfile_information: {compression_format: bz2}", "compression_format is `bz2`"),
+        ("rosbag2_bagfile_information: {}", "relative_file_paths is missing or empty"),
+        ("rosbag2_bagfile_information: {relative_file_paths: [gone.mcap]}", "gone.mcap: No such file"),
     ] {
         fs::write(folder.path().join("metadata.yaml"), metadata).unwrap();
-        assert!(
-            refusal(folder.path()).contains(expected),
-            "{}",
-            refusal(folder.path())
-        );
+        assert!(refusal(folder.path()).contains(expected), "{}", refusal(folder.path()));
     }
 }
 
 #[test]
 fn a_missing_file_of_several_is_damage() {
     let folder = folder();
-    write_bag(
-        &folder.path().join("x_1.mcap"),
-        &contents(),
-        Compression::Zstd,
-        None,
-    );
+    write_bag(&folder.path().join("x_1.mcap"), &contents(), Compression::Zstd, None);
     write_metadata(folder.path(), "", "x_0.mcap, x_1.mcap");
     let mut bag = Bag::open(folder.path()).unwrap();
     assert_eq!(read(&mut bag), contents());
@@ -265,18 +193,11 @@ fn a_truncated_bag_gives_all_that_comes_before_the_cut() {
             let mut bag = Bag::open(&path).unwrap();
             let found = read(&mut bag);
             assert_eq!(found, all[..found.len()], "cut at {length}");
-            assert!(
-                found.len() >= most,
-                "cut at {length}: fewer messages than from a shorter file"
-            );
+            assert!(found.len() >= most, "cut at {length}: fewer messages than from a shorter file");
             assert_eq!(bag.summary().message_count, found.len() as u64);
             most = found.len();
             // A file cut after its data has lost only the summary.
-            assert!(
-                bag.damage().len() == 1 || most == all.len(),
-                "cut at {length}: {:?}",
-                bag.damage()
-            );
+            assert!(bag.damage().len() == 1 || most == all.len(), "cut at {length}: {:?}", bag.damage());
         }
         assert_eq!(most, all.len(), "{compression:?} {chunk_size:?}");
     }
@@ -288,21 +209,14 @@ fn a_truncated_compressed_file_gives_all_that_comes_before_the_cut() {
     let plain = small_bag(&folder);
     // Small frames, so that a cut leaves something; a rosbag2 file is one frame of 128 kB blocks.
     let bytes = fs::read(plain).unwrap();
-    let packed: Vec<u8> = bytes
-        .chunks(2000)
-        .flat_map(|part| zstd::encode_all(part, 1).unwrap())
-        .collect();
+    let packed: Vec<u8> = bytes.chunks(2000).flat_map(|part| zstd::encode_all(part, 1).unwrap()).collect();
     let path = folder.path().join("cut.mcap.zstd");
     fs::write(&path, &packed[..packed.len() * 2 / 3]).unwrap();
     let mut bag = Bag::open(&path).unwrap();
     let found = read(&mut bag);
     assert!(found.len() > 50 && found.len() < 200);
     assert_eq!(found, contents()[..found.len()]);
-    assert!(
-        bag.damage()
-            .iter()
-            .any(|damage| damage.to_string().contains("cut.mcap.zstd"))
-    );
+    assert!(bag.damage().iter().any(|damage| damage.to_string().contains("cut.mcap.zstd")));
 }
 
 #[test]
@@ -319,16 +233,8 @@ fn a_corrupt_chunk_is_left_out_and_the_others_are_read() {
         fs::write(&path, &corrupt).unwrap();
         let mut bag = Bag::open(&path).unwrap();
         let found = read(&mut bag);
-        assert!(
-            found.len() >= 160,
-            "byte {position}: {} messages, {:?}",
-            found.len(),
-            bag.damage()
-        );
-        assert!(
-            found.iter().all(|message| all.contains(message)),
-            "byte {position}"
-        );
+        assert!(found.len() >= 160, "byte {position}: {} messages, {:?}", found.len(), bag.damage());
+        assert!(found.iter().all(|message| all.contains(message)), "byte {position}");
         if found.len() < 200 {
             left_out += 1;
             assert!(!bag.damage().is_empty(), "byte {position}");

@@ -13,8 +13,7 @@ use std::process::Command;
 
 use bayesian_object_models::math::Screw;
 use bayesian_object_models::mechanism::{
-    Body, JointParameters, JointType, Limit, State, Tree, WrenchPoint, WrenchSample, WrenchTrack,
-    rollout,
+    Body, JointParameters, JointType, Limit, State, Tree, WrenchPoint, WrenchSample, WrenchTrack, rollout,
 };
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 use serde::Deserialize;
@@ -111,13 +110,14 @@ fn worst_error(chain: &Chain, step_s: f64) -> f64 {
         .collect();
     let mut track = WrenchTrack::new(chain.force_body, &samples);
     track.point = WrenchPoint::Carried(Vector3::from(chain.force_point));
-    let times: Vec<f64> =
-        (0..chain.positions.len()).map(|i| i as f64 * chain.output_period_s).collect();
+    let times: Vec<f64> = (0..chain.positions.len()).map(|i| i as f64 * chain.output_period_s).collect();
     let start = State::at_rest(chain.bodies.len());
     let run = rollout(&tree, &start, &[track], &times, step_s).unwrap();
-    let errors = chain.positions.iter().enumerate().flat_map(|(i, expected)| {
-        run.positions(i).iter().zip(expected).map(|(q, expected)| (q - expected).abs())
-    });
+    let errors = chain
+        .positions
+        .iter()
+        .enumerate()
+        .flat_map(|(i, expected)| run.positions(i).iter().zip(expected).map(|(q, expected)| (q - expected).abs()));
     errors.fold(0.0, f64::max)
 }
 

@@ -19,12 +19,9 @@ fn shared_bags() -> Vec<PathBuf> {
         eprintln!("SKIPPED: {} is not there", folder.display());
         return Vec::new();
     };
-    let folders = entries
-        .map(|entry| entry.unwrap().path())
-        .filter(|path| path.is_dir());
-    let mut bags: Vec<PathBuf> = folders
-        .map(|path| path.join(path.file_name().unwrap()).with_extension("mcap"))
-        .collect();
+    let folders = entries.map(|entry| entry.unwrap().path()).filter(|path| path.is_dir());
+    let mut bags: Vec<PathBuf> =
+        folders.map(|path| path.join(path.file_name().unwrap()).with_extension("mcap")).collect();
     bags.sort();
     bags
 }
@@ -34,11 +31,7 @@ fn read(path: &Path) -> (Bag, Ingest, Vec<Input>) {
     let mut ingest = Ingest::new(&InputConfig::default());
     let mut inputs = Vec::new();
     for message in &mut bag {
-        inputs.extend(ingest.push(
-            &message.topic.name,
-            &message.topic.type_name,
-            message.bytes(),
-        ));
+        inputs.extend(ingest.push(&message.topic.name, &message.topic.type_name, message.bytes()));
     }
     inputs.extend(ingest.flush());
     (bag, ingest, inputs)
@@ -51,23 +44,11 @@ fn every_message_of_the_shared_bags_becomes_an_input() {
         let (bag, ingest, inputs) = read(&path);
         let counters = ingest.counters();
         let elapsed_s = begin.elapsed().as_secs_f64();
-        eprintln!(
-            "{}: {:.3} s, {} inputs, {counters:?}",
-            path.display(),
-            elapsed_s,
-            inputs.len()
-        );
+        eprintln!("{}: {:.3} s, {} inputs, {counters:?}", path.display(), elapsed_s, inputs.len());
         assert!(bag.damage().is_empty(), "{:?}", bag.damage());
         assert_eq!(bag.bytes_read(), bag.summary().bytes);
-        assert!(
-            ingest.diagnostics().is_empty(),
-            "{:?}",
-            ingest.diagnostics()
-        );
-        assert_eq!(
-            inputs.len() as u64,
-            counters.clouds_in + counters.wrenches_in
-        );
+        assert!(ingest.diagnostics().is_empty(), "{:?}", ingest.diagnostics());
+        assert_eq!(inputs.len() as u64, counters.clouds_in + counters.wrenches_in);
         assert!(counters.clouds_in > 50 && counters.wrenches_in > 500);
         // Debug builds and loaded machines are slower; a release build takes some .1 s.
         assert!(elapsed_s < 10.0);
@@ -86,12 +67,7 @@ fn two_cameras_are_two_sources_and_a_fused_cloud_has_no_viewpoint() {
             })
         };
         let sources: BTreeSet<usize> = clouds().map(|cloud| cloud.source).collect();
-        assert_eq!(
-            sources.len(),
-            if fused { 1 } else { 2 },
-            "{}",
-            path.display()
-        );
+        assert_eq!(sources.len(), if fused { 1 } else { 2 }, "{}", path.display());
         assert!(clouds().all(|cloud| cloud.viewpoint_in_world.is_none() == fused));
     }
 }

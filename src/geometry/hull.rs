@@ -53,11 +53,7 @@ pub fn hull_properties(points: &[Vector3<f64>], viewpoint: Option<&Vector3<f64>>
             0.0 => (-0.5 * shift, 0.5 * shift),
             s => (Vector3::zeros(), s * shift),
         };
-        solid = points
-            .iter()
-            .flat_map(|p| [p + front, p + back])
-            .map(|p| [p.x, p.y, p.z].into())
-            .collect();
+        solid = points.iter().flat_map(|p| [p + front, p + back]).map(|p| [p.x, p.y, p.z].into()).collect();
     }
     let (vertices, triangles) = try_convex_hull(&solid).ok()?;
     let properties = MassProperties::from_convex_polyhedron(1.0, &vertices, &triangles);
@@ -115,6 +111,8 @@ mod tests {
     #[test]
     fn points_on_a_line_have_no_volume() {
         let line: Vec<_> = (0..10).map(|i| Vector3::new(f64::from(i), 0.0, 0.0)).collect();
-        assert!(hull_properties(&line, None).is_none() || hull_properties(&line, None).is_some_and(|h| h.volume < 1e-6));
+        assert!(
+            hull_properties(&line, None).is_none() || hull_properties(&line, None).is_some_and(|h| h.volume < 1e-6)
+        );
     }
 }

@@ -29,10 +29,7 @@ pub struct Belief<N: Ord + Clone, S: Ord> {
 
 impl<N: Ord + Clone, S: Ord> Default for Belief<N, S> {
     fn default() -> Self {
-        Self {
-            priors: BTreeMap::new(),
-            sites: BTreeMap::new(),
-        }
+        Self { priors: BTreeMap::new(), sites: BTreeMap::new() }
     }
 }
 
@@ -47,11 +44,7 @@ pub struct Joint<N: Ord> {
 impl<N: Ord + Clone> Joint<N> {
     /// Indices of a block's numbers; none if it is not in the product.
     pub fn places(&self, block: &N) -> Vec<usize> {
-        self.places
-            .get(block)
-            .map_or_else(Vec::new, |&(start, length)| {
-                (start..start + length).collect()
-            })
+        self.places.get(block).map_or_else(Vec::new, |&(start, length)| (start..start + length).collect())
     }
 
     /// Mean and covariance of some blocks, one after the other.
@@ -60,9 +53,7 @@ impl<N: Ord + Clone> Joint<N> {
         let (mean, covariance) = self.gaussian.moments()?;
         Ok((
             DVector::from_fn(places.len(), |i, _| mean[places[i]]),
-            DMatrix::from_fn(places.len(), places.len(), |i, j| {
-                covariance[(places[i], places[j])]
-            }),
+            DMatrix::from_fn(places.len(), places.len(), |i, j| covariance[(places[i], places[j])]),
         ))
     }
 }
@@ -101,9 +92,8 @@ impl<N: Ord + Clone, S: Ord> Belief<N, S> {
     /// Drops the sites that mention a block; says which.
     pub fn drop_sites_of(&mut self, block: &N) -> Vec<S> {
         let sites = std::mem::take(&mut self.sites);
-        let (dropped, kept): (BTreeMap<_, _>, BTreeMap<_, _>) = sites
-            .into_iter()
-            .partition(|(_, f)| f.blocks.iter().any(|(name, _)| name == block));
+        let (dropped, kept): (BTreeMap<_, _>, BTreeMap<_, _>) =
+            sites.into_iter().partition(|(_, f)| f.blocks.iter().any(|(name, _)| name == block));
         self.sites = kept;
         dropped.into_keys().collect()
     }
@@ -113,12 +103,7 @@ impl<N: Ord + Clone, S: Ord> Belief<N, S> {
         let factors: Vec<&Factor<N>> = self
             .priors
             .values()
-            .chain(
-                self.sites
-                    .iter()
-                    .filter(|(name, _)| Some(*name) != without)
-                    .map(|(_, f)| f),
-            )
+            .chain(self.sites.iter().filter(|(name, _)| Some(*name) != without).map(|(_, f)| f))
             .collect();
         let mut places: BTreeMap<N, (usize, usize)> = BTreeMap::new();
         for (name, length) in factors.iter().flat_map(|f| &f.blocks) {
@@ -129,16 +114,9 @@ impl<N: Ord + Clone, S: Ord> Belief<N, S> {
             *start = total;
             total += *length;
         }
-        let mut joint = Joint {
-            places,
-            gaussian: Gaussian::flat(total),
-        };
+        let mut joint = Joint { places, gaussian: Gaussian::flat(total) };
         for factor in factors {
-            let at: Vec<usize> = factor
-                .blocks
-                .iter()
-                .flat_map(|(name, _)| joint.places(name))
-                .collect();
+            let at: Vec<usize> = factor.blocks.iter().flat_map(|(name, _)| joint.places(name)).collect();
             joint.gaussian.multiply_at(&factor.gaussian, &at);
         }
         joint
@@ -151,12 +129,8 @@ mod tests {
 
     fn factor(mean: f64, deviation: f64) -> Factor<&'static str> {
         let covariance = DMatrix::from_element(1, 1, deviation * deviation);
-        let gaussian =
-            Gaussian::from_moments(&DVector::from_element(1, mean), &covariance).expect("positive");
-        Factor {
-            blocks: vec![("x", 1)],
-            gaussian,
-        }
+        let gaussian = Gaussian::from_moments(&DVector::from_element(1, mean), &covariance).expect("positive");
+        Factor { blocks: vec![("x", 1)], gaussian }
     }
 
     #[test]
@@ -177,13 +151,7 @@ mod tests {
                     precision: posterior.precision - cavity.gaussian.precision,
                     information: posterior.information - cavity.gaussian.information,
                 };
-                belief.replace(
-                    site,
-                    Factor {
-                        blocks: vec![("x", 1)],
-                        gaussian,
-                    },
-                );
+                belief.replace(site, Factor { blocks: vec![("x", 1)], gaussian });
             }
         }
         let (_, after) = belief.product(None).moments(&["x"]).expect("proper");

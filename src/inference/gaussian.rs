@@ -16,23 +16,13 @@ pub struct Gaussian {
 impl Gaussian {
     /// The factor that says nothing of `dimension` numbers.
     pub fn flat(dimension: usize) -> Self {
-        Self {
-            precision: DMatrix::zeros(dimension, dimension),
-            information: DVector::zeros(dimension),
-        }
+        Self { precision: DMatrix::zeros(dimension, dimension), information: DVector::zeros(dimension) }
     }
 
     /// From mean and covariance.
     pub fn from_moments(mean: &DVector<f64>, covariance: &DMatrix<f64>) -> Result<Self, Failure> {
-        let precision = covariance
-            .clone()
-            .cholesky()
-            .ok_or(Failure::Singular)?
-            .inverse();
-        Ok(Self {
-            information: &precision * mean,
-            precision,
-        })
+        let precision = covariance.clone().cholesky().ok_or(Failure::Singular)?.inverse();
+        Ok(Self { information: &precision * mean, precision })
     }
 
     /// How many numbers it is about.
@@ -65,19 +55,14 @@ impl Gaussian {
         let (mean, covariance) = self.moments()?;
         Self::from_moments(
             &DVector::from_fn(places.len(), |i, _| mean[places[i]]),
-            &DMatrix::from_fn(places.len(), places.len(), |i, j| {
-                covariance[(places[i], places[j])]
-            }),
+            &DMatrix::from_fn(places.len(), places.len(), |i, j| covariance[(places[i], places[j])]),
         )
     }
 
     /// The factor of y that this one of x = map · y + shift is.
     pub fn pull_back(&self, map: &DMatrix<f64>, shift: &DVector<f64>) -> Self {
         let information = map.transpose() * (&self.information - &self.precision * shift);
-        Self {
-            precision: map.transpose() * &self.precision * map,
-            information,
-        }
+        Self { precision: map.transpose() * &self.precision * map, information }
     }
 
     /// −½ (x − m)ᵀ Λ (x − m) at x, for a proper Gaussian; up to its value at the mean else.

@@ -54,11 +54,7 @@ pub struct SolverSettings {
 
 impl Default for SolverSettings {
     fn default() -> Self {
-        Self {
-            steps: 15,
-            tolerance: 0.05,
-            longest: 1.0,
-        }
+        Self { steps: 15, tolerance: 0.05, longest: 1.0 }
     }
 }
 
@@ -86,11 +82,7 @@ pub fn solve(
     start: &DVector<f64>,
     settings: &SolverSettings,
 ) -> Result<Solution, Failure> {
-    let prior_cholesky = prior
-        .precision
-        .clone()
-        .cholesky()
-        .ok_or(Failure::Singular)?;
+    let prior_cholesky = prior.precision.clone().cholesky().ok_or(Failure::Singular)?;
     let mean = prior_cholesky.solve(&prior.information);
     let prior_cost = |x: &DVector<f64>| 0.5 * (x - &mean).dot(&(&prior.precision * (x - &mean)));
     let mut point = start.clone();
@@ -117,10 +109,7 @@ pub fn solve(
                 step *= settings.longest / longest;
             }
             let trial = &point + &step;
-            let trial_cost = problem
-                .cost(&trial)
-                .map(|c| c + prior_cost(&trial))
-                .unwrap_or(f64::INFINITY);
+            let trial_cost = problem.cost(&trial).map(|c| c + prior_cost(&trial)).unwrap_or(f64::INFINITY);
             let length = step.dot(&(&hessian * &step)).sqrt();
             if length < settings.tolerance && damping < 1.0 {
                 converged = true;
@@ -143,20 +132,10 @@ pub fn solve(
             converged = true;
         }
     }
-    let hessian = (&here.curvature + &prior.precision)
-        .cholesky()
-        .ok_or(Failure::Singular)?;
+    let hessian = (&here.curvature + &prior.precision).cholesky().ok_or(Failure::Singular)?;
     let cost = here.cost + prior_cost(&point);
-    let log_evidence =
-        -cost - half_log_determinant(&hessian) + half_log_determinant(&prior_cholesky);
-    Ok(Solution {
-        point,
-        linearization: here,
-        cost,
-        log_evidence,
-        steps,
-        converged,
-    })
+    let log_evidence = -cost - half_log_determinant(&hessian) + half_log_determinant(&prior_cholesky);
+    Ok(Solution { point, linearization: here, cost, log_evidence, steps, converged })
 }
 
 fn half_log_determinant(cholesky: &nalgebra::Cholesky<f64, nalgebra::Dyn>) -> f64 {
@@ -186,18 +165,9 @@ mod tests {
 
     #[test]
     fn finds_the_maximum_from_afar() {
-        let prior = Gaussian::from_moments(&DVector::zeros(1), &DMatrix::from_element(1, 1, 100.0))
-            .expect("proper");
-        let solution = solve(
-            &mut Exponential,
-            &prior,
-            &DVector::from_element(1, -3.0),
-            &SolverSettings::default(),
-        )
-        .expect("regular");
-        assert!(
-            solution.converged && (solution.point[0] - 2f64.ln()).abs() < 1e-3,
-            "{solution:?}"
-        );
+        let prior = Gaussian::from_moments(&DVector::zeros(1), &DMatrix::from_element(1, 1, 100.0)).expect("proper");
+        let solution = solve(&mut Exponential, &prior, &DVector::from_element(1, -3.0), &SolverSettings::default())
+            .expect("regular");
+        assert!(solution.converged && (solution.point[0] - 2f64.ln()).abs() < 1e-3, "{solution:?}");
     }
 }

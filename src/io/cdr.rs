@@ -53,9 +53,7 @@ pub enum CdrError {
 /// A short, foreign or inconsistent message, with the byte where decoding stopped.
 pub fn decode<'de, T: Deserialize<'de>>(message: &'de [u8]) -> Result<T, CdrError> {
     let Some((header, body)) = message.split_first_chunk::<HEADER_LENGTH>() else {
-        return Err(CdrError::TooShort {
-            length: message.len(),
-        });
+        return Err(CdrError::TooShort { length: message.len() });
     };
     match [header[0], header[1]] {
         [0, 0] => decode_body::<T, BigEndian>(body),
@@ -101,17 +99,8 @@ mod tests {
     #[test]
     fn errors_say_what_and_where() {
         let error = |bytes: &[u8]| decode::<u32>(bytes).unwrap_err().to_string();
-        assert_eq!(
-            error(&[0, 1]),
-            "2 bytes, need at least the 4 of the CDR header"
-        );
-        assert_eq!(
-            error(&[0, 3, 0, 0]),
-            "encapsulation 00 03, expected plain CDR: 00 00 or 00 01"
-        );
-        assert_eq!(
-            error(&[0, 1, 0, 0, 7]),
-            "byte 4 of 5: unexpected end of input"
-        );
+        assert_eq!(error(&[0, 1]), "2 bytes, need at least the 4 of the CDR header");
+        assert_eq!(error(&[0, 3, 0, 0]), "encapsulation 00 03, expected plain CDR: 00 00 or 00 01");
+        assert_eq!(error(&[0, 1, 0, 0, 7]), "byte 4 of 5: unexpected end of input");
     }
 }

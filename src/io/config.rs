@@ -92,10 +92,7 @@ impl Config {
     /// # Errors
     /// With the file, the key and the reason.
     pub fn from_file(path: &Path) -> Result<Self, ConfigError> {
-        let text = fs::read_to_string(path).map_err(|source| ConfigError::Read {
-            path: path.to_owned(),
-            source,
-        })?;
+        let text = fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
         Self::parse(&text, path)
     }
 
@@ -104,76 +101,43 @@ impl Config {
     /// # Errors
     /// With the key and the reason.
     pub fn parse(text: &str, path: &Path) -> Result<Self, ConfigError> {
-        let has_content =
-            |line: &str| !matches!(line.trim_start().chars().next(), None | Some('#'));
+        let has_content = |line: &str| !matches!(line.trim_start().chars().next(), None | Some('#'));
         if !text.lines().any(has_content) {
             return Ok(Self::default());
         }
-        let key_error = |key: String, reason: String| ConfigError::Key {
-            path: path.to_owned(),
-            key,
-            reason,
-        };
-        let config: Self = serde_path_to_error::deserialize(serde_yaml_ng::Deserializer::from_str(
-            text,
-        ))
-        .map_err(|error| {
-            let key = error.path().to_string();
-            let reason = without_key(&error.inner().to_string(), &key);
-            key_error(key, reason)
-        })?;
-        config
-            .check()
-            .map_err(|(key, reason)| key_error(key, reason))?;
+        let key_error = |key: String, reason: String| ConfigError::Key { path: path.to_owned(), key, reason };
+        let config: Self =
+            serde_path_to_error::deserialize(serde_yaml_ng::Deserializer::from_str(text)).map_err(|error| {
+                let key = error.path().to_string();
+                let reason = without_key(&error.inner().to_string(), &key);
+                key_error(key, reason)
+            })?;
+        config.check().map_err(|(key, reason)| key_error(key, reason))?;
         Ok(config)
     }
 
     /// The key and the reason of the first value that makes no sense.
     fn check(&self) -> Result<(), (String, String)> {
         // Heavier than any planet's; a wrong unit shows here.
-        let strength: f64 = self
-            .gravity_m_s2
-            .iter()
-            .map(|component| component * component)
-            .sum::<f64>()
-            .sqrt();
+        let strength: f64 = self.gravity_m_s2.iter().map(|component| component * component).sum::<f64>().sqrt();
         if strength.is_nan() || strength > 100.0 {
-            return Err((
-                "gravity_m_s2".into(),
-                format!("{:?}, expected at most 100 m/s²", self.gravity_m_s2),
-            ));
+            return Err(("gravity_m_s2".into(), format!("{:?}, expected at most 100 m/s²", self.gravity_m_s2)));
         }
         let positive = [
             ("windows.force_threshold_n", self.windows.force_threshold_n),
             ("windows.smoothing_s", self.windows.smoothing_s),
             ("windows.quiet_s", self.windows.quiet_s),
             ("windows.longest_s", self.windows.longest_s),
-            (
-                "kinematics.tool_offset_sigma",
-                self.kinematics.tool_offset_sigma,
-            ),
+            ("kinematics.tool_offset_sigma", self.kinematics.tool_offset_sigma),
             ("kinematics.shared_error", self.kinematics.shared_error),
-            (
-                "kinematics.shared_distance",
-                self.kinematics.shared_distance,
-            ),
-            (
-                "kinematics.rest_deviations",
-                self.kinematics.rest_deviations,
-            ),
-            (
-                "kinematics.student_freedom",
-                self.kinematics.student_freedom,
-            ),
+            ("kinematics.shared_distance", self.kinematics.shared_distance),
+            ("kinematics.rest_deviations", self.kinematics.rest_deviations),
+            ("kinematics.student_freedom", self.kinematics.student_freedom),
             ("kinematics.steps", self.kinematics.steps as f64),
         ];
-        positive
-            .into_iter()
-            .try_for_each(|(key, value)| positive_number(key, value))?;
-        for (key, value) in [
-            ("posterior_latency_s", self.posterior_latency_s),
-            ("windows.lead_s", self.windows.lead_s),
-        ] {
+        positive.into_iter().try_for_each(|(key, value)| positive_number(key, value))?;
+        for (key, value) in [("posterior_latency_s", self.posterior_latency_s), ("windows.lead_s", self.windows.lead_s)]
+        {
             if !(0.0..=1e6).contains(&value) {
                 return Err((key.into(), format!("{value}, expected 0 to 1e6")));
             }
@@ -186,10 +150,7 @@ fn positive_number(key: &str, value: f64) -> Result<(), (String, String)> {
     if value > 0.0 && value <= 1e6 {
         return Ok(());
     }
-    Err((
-        key.into(),
-        format!("{value}, expected above 0 and at most 1e6"),
-    ))
+    Err((key.into(), format!("{value}, expected above 0 and at most 1e6")))
 }
 
 /// What counts as an observation.
@@ -279,50 +240,29 @@ impl InputConfig {
     pub fn pose_label(&self, topic: &str) -> Option<Label> {
         let pattern = self.absolute(&self.poses);
         let (before, after) = pattern.split_once("{label}")?;
-        topic
-            .strip_prefix(before)?
-            .strip_suffix(after)?
-            .parse()
-            .ok()
-            .map(Label)
+        topic.strip_prefix(before)?.strip_suffix(after)?.parse().ok().map(Label)
     }
 
     fn check(&self) -> Result<(), (String, String)> {
         for (key, value) in [
             ("input.tf_history_s", self.tf_history_s),
             ("input.tf_timeout_s", self.tf_timeout_s),
-            (
-                "input.default_pose_std.rotation_rad",
-                self.default_pose_std.rotation_rad,
-            ),
-            (
-                "input.default_pose_std.position_m",
-                self.default_pose_std.position_m,
-            ),
+            ("input.default_pose_std.rotation_rad", self.default_pose_std.rotation_rad),
+            ("input.default_pose_std.position_m", self.default_pose_std.position_m),
         ] {
             positive_number(key, value)?;
         }
         if self.poses.matches("{label}").count() != 1 {
-            return Err((
-                "input.poses".into(),
-                format!("`{}`, expected {{label}} in it, once", self.poses),
-            ));
+            return Err(("input.poses".into(), format!("`{}`, expected {{label}} in it, once", self.poses)));
         }
         let wrenches = self.wrenches.iter().map(|wrench| &wrench.topic);
-        let names = self
-            .clouds
-            .iter()
-            .chain(wrenches)
-            .chain([&self.tf, &self.tf_static]);
+        let names = self.clouds.iter().chain(wrenches).chain([&self.tf, &self.tf_static]);
         let mut topics: Vec<String> = names.map(|name| self.absolute(name)).collect();
         topics.sort();
         if let Some(pair) = topics.windows(2).find(|pair| pair[0] == pair[1]) {
             return Err(("input".into(), format!("topic {} is given twice", pair[0])));
         }
-        for (key, value) in [
-            ("input.fixed_frame", &self.fixed_frame),
-            ("input.label_field", &self.label_field),
-        ] {
+        for (key, value) in [("input.fixed_frame", &self.fixed_frame), ("input.label_field", &self.label_field)] {
             if value.is_empty() {
                 return Err((key.into(), "is empty".into()));
             }
@@ -345,11 +285,7 @@ pub struct WrenchTopic {
 
 impl Default for WrenchTopic {
     fn default() -> Self {
-        Self {
-            topic: "wrench".into(),
-            part: PartBinding::Auto,
-            reaction: false,
-        }
+        Self { topic: "wrench".into(), part: PartBinding::Auto, reaction: false }
     }
 }
 
@@ -405,8 +341,7 @@ impl de::Visitor<'_> for PartBindingVisitor {
     }
 
     fn visit_u64<E: de::Error>(self, label: u64) -> Result<PartBinding, E> {
-        let label = u32::try_from(label)
-            .map_err(|_| E::invalid_value(de::Unexpected::Unsigned(label), &self))?;
+        let label = u32::try_from(label).map_err(|_| E::invalid_value(de::Unexpected::Unsigned(label), &self))?;
         Ok(PartBinding::Part(Label(label)))
     }
 }
@@ -423,10 +358,7 @@ pub struct PoseStd {
 
 impl Default for PoseStd {
     fn default() -> Self {
-        Self {
-            rotation_rad: 0.01,
-            position_m: 0.002,
-        }
+        Self { rotation_rad: 0.01, position_m: 0.002 }
     }
 }
 
@@ -459,39 +391,15 @@ mod tests {
     #[test]
     fn errors_name_file_key_and_reason() {
         for (text, expected) in [
-            (
-                "input: {topics: 3}",
-                "bom.yaml: key `input.topics`: unknown field `topics`",
-            ),
-            (
-                "input: {wrenches: [{topic: w, part: left}]}",
-                "key `input.wrenches[0].part`: invalid value",
-            ),
-            (
-                "input: {wrenches: [{part: -1}]}",
-                "key `input.wrenches[0].part`: invalid type: integer `-1`",
-            ),
-            (
-                "input: {tf_timeout_s: -1}",
-                "key `input.tf_timeout_s`: -1, expected above 0",
-            ),
-            (
-                "input: {tf_timeout_s: .nan}",
-                "key `input.tf_timeout_s`: NaN, expected above 0",
-            ),
-            (
-                "input: {poses: parts/pose}",
-                "key `input.poses`: `parts/pose`, expected {label}",
-            ),
-            (
-                "input: {clouds: [wrench]}",
-                "key `input`: topic /wrench is given twice",
-            ),
+            ("input: {topics: 3}", "bom.yaml: key `input.topics`: unknown field `topics`"),
+            ("input: {wrenches: [{topic: w, part: left}]}", "key `input.wrenches[0].part`: invalid value"),
+            ("input: {wrenches: [{part: -1}]}", "key `input.wrenches[0].part`: invalid type: integer `-1`"),
+            ("input: {tf_timeout_s: -1}", "key `input.tf_timeout_s`: -1, expected above 0"),
+            ("input: {tf_timeout_s: .nan}", "key `input.tf_timeout_s`: NaN, expected above 0"),
+            ("input: {poses: parts/pose}", "key `input.poses`: `parts/pose`, expected {label}"),
+            ("input: {clouds: [wrench]}", "key `input`: topic /wrench is given twice"),
             ("gravity_m_s2: [0, 0]", "key `gravity_m_s2"),
-            (
-                "gravity_m_s2: [0, 0, -9810]",
-                "key `gravity_m_s2`: [0.0, 0.0, -9810.0], expected at most",
-            ),
+            ("gravity_m_s2: [0, 0, -9810]", "key `gravity_m_s2`: [0.0, 0.0, -9810.0], expected at most"),
             ("seed: [", "bom.yaml: key `"),
         ] {
             let message = parse(text).unwrap_err().to_string();

@@ -71,13 +71,7 @@ pub struct Diagnostic {
 impl fmt::Display for Diagnostic {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.stamp {
-            Some(stamp) => write!(
-                f,
-                "{}, stamp {:.3} s: {}",
-                self.topic,
-                stamp.0 as f64 * 1e-9,
-                self.reason
-            ),
+            Some(stamp) => write!(f, "{}, stamp {:.3} s: {}", self.topic, stamp.0 as f64 * 1e-9, self.reason),
             None => write!(f, "{}: {}", self.topic, self.reason),
         }
     }

@@ -13,10 +13,7 @@ pub fn full_text(type_name: &str) -> Option<String> {
         for dependency in dependencies(definition(&current)?) {
             if !pending.contains(&dependency) {
                 let separator = "=".repeat(80);
-                text += &format!(
-                    "{separator}\nMSG: {dependency}\n{}",
-                    definition(&dependency)?
-                );
+                text += &format!("{separator}\nMSG: {dependency}\n{}", definition(&dependency)?);
                 pending.push(dependency);
             }
         }
@@ -27,12 +24,8 @@ pub fn full_text(type_name: &str) -> Option<String> {
 
 /// The types of other messages that a definition names.
 fn dependencies(definition: &str) -> impl Iterator<Item = String> {
-    let types = definition
-        .lines()
-        .filter_map(|line| line.split_whitespace().next());
-    types
-        .filter(|name| name.contains('/'))
-        .map(|name| name.split('[').next().unwrap_or(name).to_owned())
+    let types = definition.lines().filter_map(|line| line.split_whitespace().next());
+    types.filter(|name| name.contains('/')).map(|name| name.split('[').next().unwrap_or(name).to_owned())
 }
 
 fn definition(short_name: &str) -> Option<&'static str> {
@@ -52,16 +45,10 @@ fn definition(short_name: &str) -> Option<&'static str> {
         "geometry_msgs/Quaternion" => "float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n",
         "geometry_msgs/Wrench" => "geometry_msgs/Vector3 force\ngeometry_msgs/Vector3 torque\n",
         "geometry_msgs/WrenchStamped" => "std_msgs/Header header\ngeometry_msgs/Wrench wrench\n",
-        "geometry_msgs/Pose" => {
-            "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n"
-        }
+        "geometry_msgs/Pose" => "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n",
         "geometry_msgs/PoseWithCovariance" => "geometry_msgs/Pose pose\nfloat64[36] covariance\n",
-        "geometry_msgs/PoseWithCovarianceStamped" => {
-            "std_msgs/Header header\ngeometry_msgs/PoseWithCovariance pose\n"
-        }
-        "geometry_msgs/Transform" => {
-            "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n"
-        }
+        "geometry_msgs/PoseWithCovarianceStamped" => "std_msgs/Header header\ngeometry_msgs/PoseWithCovariance pose\n",
+        "geometry_msgs/Transform" => "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n",
         "geometry_msgs/TransformStamped" => {
             "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform\n"
         }
@@ -77,12 +64,7 @@ mod tests {
 
     #[test]
     fn every_type_read_can_be_written() {
-        for (name, dependencies) in [
-            (POINT_CLOUD_TYPE, 3),
-            (WRENCH_TYPE, 4),
-            (POSE_TYPE, 6),
-            (TF_TYPE, 6),
-        ] {
+        for (name, dependencies) in [(POINT_CLOUD_TYPE, 3), (WRENCH_TYPE, 4), (POSE_TYPE, 6), (TF_TYPE, 6)] {
             let text = full_text(name).unwrap();
             assert_eq!(text.matches("\nMSG: ").count(), dependencies, "{text}");
         }

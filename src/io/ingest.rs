@@ -109,75 +109,45 @@ impl Ingest {
             return known.role;
         }
         let role = Role::of(topic, &self.config);
-        let entry = Topic {
-            role,
-            waiting: VecDeque::new(),
-            newest_in_frame: BTreeMap::new(),
-        };
+        let entry = Topic { role, waiting: VecDeque::new(), newest_in_frame: BTreeMap::new() };
         self.topics.insert(topic.to_owned(), entry);
         role
     }
 
     /// Decodes and checks one message, all but its place in world.
-    fn read(
-        &mut self,
-        topic: &str,
-        role: Role,
-        message: &[u8],
-    ) -> Result<WaitingMessage, Rejection> {
+    fn read(&mut self, topic: &str, role: Role, message: &[u8]) -> Result<WaitingMessage, Rejection> {
         match role {
             Role::Cloud => {
                 let cloud: PointCloud2 = decode(message)?;
                 let stamp = checked_stamp(&cloud.header)?;
-                let (points, dropped) = point_cloud::read_points(
-                    &cloud,
-                    &self.config.label_field,
-                    &self.config.ignored_labels,
-                )
-                .map_err(|error| {
-                    if let point_cloud::PointCloudError::NoUsablePoint { dropped, .. } = &error {
-                        count_points(&mut self.counters.points_dropped, dropped);
-                    }
-                    Rejection::new(Some(stamp), error.kind(), error.to_string())
-                })?;
+                let (points, dropped) =
+                    point_cloud::read_points(&cloud, &self.config.label_field, &self.config.ignored_labels).map_err(
+                        |error| {
+                            if let point_cloud::PointCloudError::NoUsablePoint { dropped, .. } = &error {
+                                count_points(&mut self.counters.points_dropped, dropped);
+                            }
+                            Rejection::new(Some(stamp), error.kind(), error.to_string())
+                        },
+                    )?;
                 count_points(&mut self.counters.points_dropped, &dropped);
                 self.counters.points_in += points.len() as u64;
                 let next = self.sources.len();
-                let source = *self
-                    .sources
-                    .entry((topic.to_owned(), cloud.header.frame_id.clone()))
-                    .or_insert(next);
-                Ok(WaitingMessage {
-                    stamp,
-                    frame: cloud.header.frame_id,
-                    content: Content::Cloud { source, points },
-                })
+                let source = *self.sources.entry((topic.to_owned(), cloud.header.frame_id.clone())).or_insert(next);
+                Ok(WaitingMessage { stamp, frame: cloud.header.frame_id, content: Content::Cloud { source, points } })
             }
             Role::Wrench(source) => {
                 let message: WrenchStamped = decode(message)?;
                 let stamp = checked_stamp(&message.header)?;
                 let content = Content::wrench(&message.wrench, source, &self.config, stamp)?;
-                Ok(WaitingMessage {
-                    stamp,
-                    frame: message.header.frame_id,
-                    content,
-                })
+                Ok(WaitingMessage { stamp, frame: message.header.frame_id, content })
             }
             Role::Pose(label) => {
                 let message: PoseWithCovarianceStamped = decode(message)?;
                 let stamp = checked_stamp(&message.header)?;
                 let content = Content::pose(&message.pose, label, &self.config, stamp)?;
-                Ok(WaitingMessage {
-                    stamp,
-                    frame: message.header.frame_id,
-                    content,
-                })
+                Ok(WaitingMessage { stamp, frame: message.header.frame_id, content })
             }
-            Role::Tf | Role::TfStatic => Err(Rejection::new(
-                None,
-                "wrong_type",
-                "transforms do not wait".into(),
-            )),
+            Role::Tf | Role::TfStatic => Err(Rejection::new(None, "wrong_type", "transforms do not wait".into())),
         }
     }
 
@@ -189,27 +159,15 @@ impl Ingest {
             && waiting.stamp <= newest
         {
             let (kind, reason) = if waiting.stamp == newest {
-                (
-                    "duplicate_stamp",
-                    format!("frame `{}`: the stamp came before", waiting.frame),
-                )
+                ("duplicate_stamp", format!("frame `{}`: the stamp came before", waiting.frame))
             } else {
                 let by_s = newest.seconds_since(waiting.stamp);
-                (
-                    "backward_stamp",
-                    format!("frame `{}`: stamp goes back by {by_s:.3} s", waiting.frame),
-                )
+                ("backward_stamp", format!("frame `{}`: stamp goes back by {by_s:.3} s", waiting.frame))
             };
-            self.reject(
-                topic,
-                role,
-                Rejection::new(Some(waiting.stamp), kind, reason),
-            );
+            self.reject(topic, role, Rejection::new(Some(waiting.stamp), kind, reason));
             return;
         }
-        state
-            .newest_in_frame
-            .insert(waiting.frame.clone(), waiting.stamp);
+        state.newest_in_frame.insert(waiting.frame.clone(), waiting.stamp);
         self.newest = self.newest.max(Some(waiting.stamp));
         state.waiting.push_back(waiting);
     }
@@ -247,12 +205,8 @@ impl Ingest {
                 continue;
             };
             while let Some(waiting) = topic.waiting.pop_front() {
-                let looked_up =
-                    self.transforms
-                        .lookup(&self.config.fixed_frame, &waiting.frame, waiting.stamp);
-                let waited_s = self
-                    .newest
-                    .map_or(0.0, |newest| newest.seconds_since(waiting.stamp));
+                let looked_up = self.transforms.lookup(&self.config.fixed_frame, &waiting.frame, waiting.stamp);
+                let waited_s = self.newest.map_or(0.0, |newest| newest.seconds_since(waiting.stamp));
                 let give_up = at_end || waited_s > self.config.tf_timeout_s;
                 match looked_up {
                     Ok(world_from_frame) => {
@@ -267,8 +221,7 @@ impl Ingest {
                         break;
                     }
                     Err(error) => {
-                        let rejection =
-                            Rejection::new(Some(waiting.stamp), error.kind(), error.to_string());
+                        let rejection = Rejection::new(Some(waiting.stamp), error.kind(), error.to_string());
                         rejections.push((name.clone(), role, rejection));
                     }
                 }
@@ -298,17 +251,8 @@ impl Ingest {
         };
         Counters::add(reasons, rejection.kind, 1);
         if self.reported.insert((topic.to_owned(), rejection.kind)) {
-            let Rejection {
-                stamp,
-                kind,
-                reason,
-            } = rejection;
-            let diagnostic = Diagnostic {
-                topic: topic.to_owned(),
-                stamp,
-                kind,
-                reason,
-            };
+            let Rejection { stamp, kind, reason } = rejection;
+            let diagnostic = Diagnostic { topic: topic.to_owned(), stamp, kind, reason };
             warn!("{diagnostic}; further ones are only counted");
             self.diagnostics.push(diagnostic);
         }
@@ -322,10 +266,7 @@ fn decode<'de, T: Deserialize<'de>>(message: &'de [u8]) -> Result<T, Rejection> 
 fn checked_stamp(header: &Header) -> Result<Stamp, Rejection> {
     let stamp = header.stamp;
     if stamp.nanosec >= 1_000_000_000 {
-        let reason = format!(
-            "stamp has {} nanoseconds, expected below 10⁹",
-            stamp.nanosec
-        );
+        let reason = format!("stamp has {} nanoseconds, expected below 10⁹", stamp.nanosec);
         return Err(Rejection::new(None, "bad_stamp", reason));
     }
     Ok(stamp.into())

@@ -32,10 +32,7 @@ impl From<Stamp> for Time {
     fn from(stamp: Stamp) -> Self {
         let sec = stamp.0.div_euclid(1_000_000_000);
         let sec = i32::try_from(sec).unwrap_or(if sec < 0 { i32::MIN } else { i32::MAX });
-        Self {
-            sec,
-            nanosec: stamp.0.rem_euclid(1_000_000_000) as u32,
-        }
+        Self { sec, nanosec: stamp.0.rem_euclid(1_000_000_000) as u32 }
     }
 }
 
@@ -110,11 +107,7 @@ impl From<Xyz> for Vector3<f64> {
 
 impl From<Vector3<f64>> for Xyz {
     fn from(vector: Vector3<f64>) -> Self {
-        Self {
-            x: vector.x,
-            y: vector.y,
-            z: vector.z,
-        }
+        Self { x: vector.x, y: vector.y, z: vector.z }
     }
 }
 
@@ -136,8 +129,7 @@ impl RawQuaternion {
     /// `QUATERNION_NORMALIZATION_TOLERANCE`); rounding is then divided out.
     pub fn unit(self) -> Option<UnitQuaternion<f64>> {
         let quaternion = Quaternion::new(self.w, self.x, self.y, self.z);
-        ((quaternion.norm_squared() - 1.0).abs() <= 0.01)
-            .then(|| UnitQuaternion::from_quaternion(quaternion))
+        ((quaternion.norm_squared() - 1.0).abs() <= 0.01).then(|| UnitQuaternion::from_quaternion(quaternion))
     }
 
     /// Its norm, for error messages.
@@ -148,12 +140,7 @@ impl RawQuaternion {
 
 impl From<UnitQuaternion<f64>> for RawQuaternion {
     fn from(rotation: UnitQuaternion<f64>) -> Self {
-        Self {
-            x: rotation.i,
-            y: rotation.j,
-            z: rotation.k,
-            w: rotation.w,
-        }
+        Self { x: rotation.i, y: rotation.j, z: rotation.k, w: rotation.w }
     }
 }
 
@@ -214,10 +201,7 @@ pub struct RawTransform {
 
 impl From<Pose> for RawTransform {
     fn from(pose: Pose) -> Self {
-        Self {
-            translation: pose.translation.into(),
-            rotation: pose.quaternion().into(),
-        }
+        Self { translation: pose.translation.into(), rotation: pose.quaternion().into() }
     }
 }
 
@@ -246,24 +230,13 @@ mod tests {
 
     #[test]
     fn every_message_survives_both_byte_orders() {
-        let header = Header {
-            stamp: Time {
-                sec: -3,
-                nanosec: 999_999_999,
-            },
-            frame_id: "cam".into(),
-        };
+        let header = Header { stamp: Time { sec: -3, nanosec: 999_999_999 }, frame_id: "cam".into() };
         let rotation = UnitQuaternion::from_euler_angles(0.1, -0.2, 0.3);
         let cloud = PointCloud2 {
             header: header.clone(),
             height: 1,
             width: 3,
-            fields: vec![PointField {
-                name: "x".into(),
-                offset: 0,
-                datatype: 7,
-                count: 1,
-            }],
+            fields: vec![PointField { name: "x".into(), offset: 0, datatype: 7, count: 1 }],
             is_bigendian: false,
             point_step: 1,
             row_step: 3,
@@ -272,60 +245,26 @@ mod tests {
         };
         let wrench = WrenchStamped {
             header: header.clone(),
-            wrench: Wrench {
-                force: Xyz {
-                    x: 1.0,
-                    y: 2.0,
-                    z: 3.0,
-                },
-                torque: Xyz {
-                    x: 4.0,
-                    y: 5.0,
-                    z: 6.0,
-                },
-            },
+            wrench: Wrench { force: Xyz { x: 1.0, y: 2.0, z: 3.0 }, torque: Xyz { x: 4.0, y: 5.0, z: 6.0 } },
         };
         let pose = PoseWithCovarianceStamped {
             header: header.clone(),
             pose: PoseWithCovariance {
-                pose: RawPose {
-                    position: Xyz {
-                        x: 1.0,
-                        y: 2.0,
-                        z: 3.0,
-                    },
-                    orientation: rotation.into(),
-                },
-                covariance: std::array::from_fn(|row| {
-                    std::array::from_fn(|column| (row + column) as f64)
-                }),
+                pose: RawPose { position: Xyz { x: 1.0, y: 2.0, z: 3.0 }, orientation: rotation.into() },
+                covariance: std::array::from_fn(|row| std::array::from_fn(|column| (row + column) as f64)),
             },
         };
         let transform = Pose::from_quaternion(&rotation, Vector3::new(1.0, 2.0, 3.0)).into();
-        let tf = TfMessage {
-            transforms: vec![
-                TransformStamped {
-                    header,
-                    child_frame_id: "tool".into(),
-                    transform
-                };
-                2
-            ],
-        };
+        let tf =
+            TfMessage { transforms: vec![TransformStamped { header, child_frame_id: "tool".into(), transform }; 2] };
         for endianness in [Endianness::Big, Endianness::Little] {
             let bytes = cdr::encode(&cloud, endianness).unwrap();
             assert_eq!(cdr::decode::<PointCloud2>(&bytes).unwrap(), cloud);
-            assert!(matches!(
-                cdr::decode::<PointCloud2>(&bytes).unwrap().data,
-                Cow::Borrowed(_)
-            ));
+            assert!(matches!(cdr::decode::<PointCloud2>(&bytes).unwrap().data, Cow::Borrowed(_)));
             let bytes = cdr::encode(&wrench, endianness).unwrap();
             assert_eq!(cdr::decode::<WrenchStamped>(&bytes).unwrap(), wrench);
             let bytes = cdr::encode(&pose, endianness).unwrap();
-            assert_eq!(
-                cdr::decode::<PoseWithCovarianceStamped>(&bytes).unwrap(),
-                pose
-            );
+            assert_eq!(cdr::decode::<PoseWithCovarianceStamped>(&bytes).unwrap(), pose);
             let bytes = cdr::encode(&tf, endianness).unwrap();
             assert_eq!(cdr::decode::<TfMessage>(&bytes).unwrap(), tf);
         }
@@ -334,10 +273,7 @@ mod tests {
     #[test]
     fn stamps_before_zero_convert_both_ways() {
         for nanoseconds in [-1, 0, 1, -2_500_000_001, 1_700_000_000_123_456_789] {
-            assert_eq!(
-                Stamp::from(Time::from(Stamp(nanoseconds))),
-                Stamp(nanoseconds)
-            );
+            assert_eq!(Stamp::from(Time::from(Stamp(nanoseconds))), Stamp(nanoseconds));
         }
     }
 }

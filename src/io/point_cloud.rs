@@ -117,9 +117,7 @@ impl PointCloudError {
     /// A short name for counting.
     pub fn kind(&self) -> &'static str {
         match self {
-            Self::MissingField { field, .. } if matches!(field.as_str(), "x" | "y" | "z") => {
-                "no_coordinate_field"
-            }
+            Self::MissingField { field, .. } if matches!(field.as_str(), "x" | "y" | "z") => "no_coordinate_field",
             Self::MissingField { .. } => "no_label_field",
             Self::FieldType { .. } => "bad_field_type",
             Self::Empty { .. } => "empty",
@@ -144,10 +142,7 @@ pub fn read_points(
     ignored: &[Label],
 ) -> Result<(Vec<SensorPoint>, DroppedPoints), PointCloudError> {
     if cloud.height == 0 || cloud.width == 0 {
-        return Err(PointCloudError::Empty {
-            height: cloud.height,
-            width: cloud.width,
-        });
+        return Err(PointCloudError::Empty { height: cloud.height, width: cloud.width });
     }
     let x = coordinate_field(cloud, "x")?;
     let y = coordinate_field(cloud, "y")?;
@@ -157,19 +152,10 @@ pub fn read_points(
 
     let mut dropped = DroppedPoints::default();
     let mut points = Vec::with_capacity(cloud.height as usize * cloud.width as usize);
-    let rows = cloud
-        .data
-        .chunks_exact(cloud.row_step as usize)
-        .take(cloud.height as usize);
-    for bytes in rows.flat_map(|row| {
-        row.chunks_exact(cloud.point_step as usize)
-            .take(cloud.width as usize)
-    }) {
+    let rows = cloud.data.chunks_exact(cloud.row_step as usize).take(cloud.height as usize);
+    for bytes in rows.flat_map(|row| row.chunks_exact(cloud.point_step as usize).take(cloud.width as usize)) {
         let point_in_sensor = Vector3::new(x.value(bytes), y.value(bytes), z.value(bytes));
-        if !point_in_sensor
-            .iter()
-            .all(|coordinate| coordinate.is_finite())
-        {
+        if !point_in_sensor.iter().all(|coordinate| coordinate.is_finite()) {
             dropped.not_finite += 1;
         } else if point_in_sensor.amax() > MAX_COORDINATE_M {
             dropped.out_of_range += 1;
@@ -177,10 +163,7 @@ pub fn read_points(
             match as_label(label.value(bytes)) {
                 None => dropped.bad_label += 1,
                 Some(label) if ignored.contains(&label) => dropped.ignored_label += 1,
-                Some(label) => points.push(SensorPoint {
-                    point_in_sensor,
-                    label,
-                }),
+                Some(label) => points.push(SensorPoint { point_in_sensor, label }),
             }
         }
     }
@@ -191,45 +174,21 @@ pub fn read_points(
     Ok((points, dropped))
 }
 
-fn find_field<'a>(
-    cloud: &'a PointCloud2,
-    name: &str,
-) -> Result<(&'a PointField, FieldReader), PointCloudError> {
+fn find_field<'a>(cloud: &'a PointCloud2, name: &str) -> Result<(&'a PointField, FieldReader), PointCloudError> {
     let Some(field) = cloud.fields.iter().find(|field| field.name == name) else {
-        let names: Vec<&str> = cloud
-            .fields
-            .iter()
-            .map(|field| field.name.as_str())
-            .collect();
-        return Err(PointCloudError::MissingField {
-            field: name.to_owned(),
-            present: names.join(", "),
-        });
+        let names: Vec<&str> = cloud.fields.iter().map(|field| field.name.as_str()).collect();
+        return Err(PointCloudError::MissingField { field: name.to_owned(), present: names.join(", ") });
     };
     let Some(datatype) = Datatype::from_code(field.datatype).filter(|_| field.count > 0) else {
-        return Err(field_type_error(
-            field,
-            "a datatype of 1 to 8 and at least one element",
-        ));
+        return Err(field_type_error(field, "a datatype of 1 to 8 and at least one element"));
     };
     let end = u64::from(field.offset) + datatype.size() as u64;
     if end > u64::from(cloud.point_step) {
-        return Err(PointCloudError::PointStep {
-            point_step: cloud.point_step,
-            field: name.to_owned(),
-            end,
-        });
+        return Err(PointCloudError::PointStep { point_step: cloud.point_step, field: name.to_owned(), end });
     }
     let offset = field.offset as usize;
     let big_endian = cloud.is_bigendian;
-    Ok((
-        field,
-        FieldReader {
-            offset,
-            datatype,
-            big_endian,
-        },
-    ))
+    Ok((field, FieldReader { offset, datatype, big_endian }))
 }
 
 fn coordinate_field(cloud: &PointCloud2, name: &str) -> Result<FieldReader, PointCloudError> {
@@ -242,12 +201,7 @@ fn coordinate_field(cloud: &PointCloud2, name: &str) -> Result<FieldReader, Poin
 
 fn field_type_error(field: &PointField, expected: &'static str) -> PointCloudError {
     let (datatype, count) = (field.datatype, field.count);
-    PointCloudError::FieldType {
-        field: field.name.clone(),
-        datatype,
-        count,
-        expected,
-    }
+    PointCloudError::FieldType { field: field.name.clone(), datatype, count, expected }
 }
 
 /// After this, rows and points can be sliced: both steps are positive and all bytes are there.
@@ -255,28 +209,17 @@ fn check_steps(cloud: &PointCloud2) -> Result<(), PointCloudError> {
     let need = u64::from(cloud.width) * u64::from(cloud.point_step);
     let (row_step, point_step) = (cloud.row_step, cloud.point_step);
     if u64::from(row_step) < need {
-        return Err(PointCloudError::RowStep {
-            row_step,
-            width: cloud.width,
-            point_step,
-            need,
-        });
+        return Err(PointCloudError::RowStep { row_step, width: cloud.width, point_step, need });
     }
     let need = u64::from(cloud.height) * u64::from(row_step);
     if (cloud.data.len() as u64) < need {
-        return Err(PointCloudError::DataLength {
-            length: cloud.data.len(),
-            height: cloud.height,
-            row_step,
-            need,
-        });
+        return Err(PointCloudError::DataLength { length: cloud.data.len(), height: cloud.height, row_step, need });
     }
     Ok(())
 }
 
 fn as_label(value: f64) -> Option<Label> {
-    (value.fract() == 0.0 && (0.0..=f64::from(u32::MAX)).contains(&value))
-        .then_some(Label(value as u32))
+    (value.fract() == 0.0 && (0.0..=f64::from(u32::MAX)).contains(&value)).then_some(Label(value as u32))
 }
 
 #[cfg(test)]
@@ -439,77 +382,37 @@ mod tests {
         ]];
         let cloud = cloud_of(&rows, &packed(8));
         let (points, dropped) = read_points(&cloud, "part", &[Label(9)]).unwrap();
-        assert_eq!(
-            points.iter().map(|point| point.label).collect::<Vec<_>>(),
-            [Label(u32::MAX)]
-        );
-        let expected = DroppedPoints {
-            not_finite: 2,
-            out_of_range: 1,
-            bad_label: 4,
-            ignored_label: 1,
-        };
+        assert_eq!(points.iter().map(|point| point.label).collect::<Vec<_>>(), [Label(u32::MAX)]);
+        let expected = DroppedPoints { not_finite: 2, out_of_range: 1, bad_label: 4, ignored_label: 1 };
         assert_eq!(dropped, expected);
     }
 
     #[test]
     fn each_broken_layout_has_its_own_line() {
-        let cloud = || {
-            cloud_of(
-                &[vec![[0.0, 0.0, 1.0, 1.0]; 2], vec![[f64::NAN; 4]; 2]],
-                &packed(6),
-            )
-        };
+        let cloud = || cloud_of(&[vec![[0.0, 0.0, 1.0, 1.0]; 2], vec![[f64::NAN; 4]; 2]], &packed(6));
         let message = |change: &dyn Fn(&mut PointCloud2)| {
             let mut cloud = cloud();
             change(&mut cloud);
             read_points(&cloud, "part", &[]).unwrap_err().to_string()
         };
         assert!(read_points(&cloud(), "part", &[]).is_ok());
-        assert_eq!(
-            message(&|c| c.fields[3].name = "id".into()),
-            "no field `part` (fields: x, y, z, id)"
-        );
-        assert_eq!(
-            message(&|c| c.fields[1].name = "Y".into()),
-            "no field `y` (fields: x, Y, z, part)"
-        );
+        assert_eq!(message(&|c| c.fields[3].name = "id".into()), "no field `part` (fields: x, y, z, id)");
+        assert_eq!(message(&|c| c.fields[1].name = "Y".into()), "no field `y` (fields: x, Y, z, part)");
         assert_eq!(message(&|c| c.width = 0), "no points: height 2, width 0");
-        assert_eq!(
-            message(&|c| c.point_step = 0),
-            "point_step is 0 bytes, field `x` ends at byte 4"
-        );
-        assert_eq!(
-            message(&|c| c.point_step = 15),
-            "point_step is 15 bytes, field `part` ends at byte 16"
-        );
+        assert_eq!(message(&|c| c.point_step = 0), "point_step is 0 bytes, field `x` ends at byte 4");
+        assert_eq!(message(&|c| c.point_step = 15), "point_step is 15 bytes, field `part` ends at byte 16");
         assert_eq!(
             message(&|c| c.fields[2].offset = u32::MAX),
             "point_step is 16 bytes, field `z` ends at byte 4294967299"
         );
-        assert_eq!(
-            message(&|c| c.row_step = 31),
-            "row_step is 31 bytes, 2 points of 16 bytes need 32"
-        );
-        assert_eq!(
-            message(&|c| c.height = 3),
-            "64 bytes of data, 3 rows of 32 bytes need 96"
-        );
+        assert_eq!(message(&|c| c.row_step = 31), "row_step is 31 bytes, 2 points of 16 bytes need 32");
+        assert_eq!(message(&|c| c.height = 3), "64 bytes of data, 3 rows of 32 bytes need 96");
         assert_eq!(
             message(&|c| c.fields[0].datatype = 5),
             "field `x` has datatype 5 and count 1, expected float32 (7) or float64 (8)"
         );
-        assert!(
-            message(&|c| c.fields[3].datatype = 9)
-                .starts_with("field `part` has datatype 9 and count 1")
-        );
-        assert!(
-            message(&|c| c.fields[3].count = 0)
-                .starts_with("field `part` has datatype 6 and count 0")
-        );
-        assert!(
-            message(&|c| c.data.to_mut().fill(0xFF))
-                .starts_with("no usable point of 4: 4 not finite")
-        );
+        assert!(message(&|c| c.fields[3].datatype = 9).starts_with("field `part` has datatype 9 and count 1"));
+        assert!(message(&|c| c.fields[3].count = 0).starts_with("field `part` has datatype 6 and count 0"));
+        assert!(message(&|c| c.data.to_mut().fill(0xFF)).starts_with("no usable point of 4: 4 not finite"));
     }
 }

@@ -16,9 +16,7 @@ pub(super) enum Datatype {
 impl Datatype {
     pub fn from_code(code: u8) -> Option<Self> {
         use Datatype::{F32, F64, I8, I16, I32, U8, U16, U32};
-        [I8, U8, I16, U16, I32, U32, F32, F64]
-            .get(usize::from(code).wrapping_sub(1))
-            .copied()
+        [I8, U8, I16, U16, I32, U32, F32, F64].get(usize::from(code).wrapping_sub(1)).copied()
     }
 
     pub fn size(self) -> usize {

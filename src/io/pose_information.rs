@@ -52,12 +52,8 @@ pub fn information_in_world(
             in_header[(row + 3, row + 3)] = position_m.powi(-2);
         }
     } else {
-        let measured: Vec<usize> = (0..6)
-            .filter(|row| is_measured(covariance[*row][*row]))
-            .collect();
-        let block = DMatrix::from_fn(measured.len(), measured.len(), |i, j| {
-            covariance[measured[i]][measured[j]]
-        });
+        let measured: Vec<usize> = (0..6).filter(|row| is_measured(covariance[*row][*row])).collect();
+        let block = DMatrix::from_fn(measured.len(), measured.len(), |i, j| covariance[measured[i]][measured[j]]);
         let information = invert(&block, &measured)?;
         for (i, row) in measured.iter().enumerate() {
             for (j, column) in measured.iter().enumerate() {
@@ -66,12 +62,8 @@ pub fn information_in_world(
         }
     }
     let mut rotation = Matrix6::zeros();
-    rotation
-        .fixed_view_mut::<3, 3>(0, 0)
-        .copy_from(world_from_header);
-    rotation
-        .fixed_view_mut::<3, 3>(3, 3)
-        .copy_from(world_from_header);
+    rotation.fixed_view_mut::<3, 3>(0, 0).copy_from(world_from_header);
+    rotation.fixed_view_mut::<3, 3>(3, 3).copy_from(world_from_header);
     let in_world = rotation * in_header * rotation.transpose();
     Ok((in_world + in_world.transpose()) * 0.5)
 }
@@ -86,25 +78,15 @@ fn invert(block: &DMatrix<f64>, rows: &[usize]) -> Result<DMatrix<f64>, Covarian
         for (j, column) in rows.iter().enumerate() {
             let value = block[(i, j)];
             if !value.is_finite() {
-                return Err(CovarianceError::NotFinite {
-                    row: *row,
-                    column: *column,
-                    value,
-                });
+                return Err(CovarianceError::NotFinite { row: *row, column: *column, value });
             }
         }
     }
     let symmetric = (block - block.transpose()).amax() <= 1e-6 * block.amax();
-    let inverse = block
-        .clone()
-        .cholesky()
-        .filter(|_| symmetric)
-        .map(|factor| factor.inverse());
+    let inverse = block.clone().cholesky().filter(|_| symmetric).map(|factor| factor.inverse());
     inverse
         .filter(|inverse| inverse.iter().all(|entry| entry.is_finite()))
-        .ok_or_else(|| CovarianceError::NotPositive {
-            rows: rows.to_vec(),
-        })
+        .ok_or_else(|| CovarianceError::NotPositive { rows: rows.to_vec() })
 }
 
 #[cfg(test)]
@@ -115,16 +97,13 @@ mod tests {
     const DEFAULT_STD: (f64, f64) = (0.01, 0.002);
 
     fn diagonal(variances: [f64; 6]) -> [[f64; 6]; 6] {
-        std::array::from_fn(|row| {
-            std::array::from_fn(|column| if row == column { variances[row] } else { 0.0 })
-        })
+        std::array::from_fn(|row| std::array::from_fn(|column| if row == column { variances[row] } else { 0.0 }))
     }
 
     #[test]
     fn linear_first_becomes_angular_first() {
         let covariance = diagonal([1.0, 4.0, 9.0, 0.25, 0.0625, 0.01]);
-        let information =
-            information_in_world(&covariance, &Matrix3::identity(), DEFAULT_STD).unwrap();
+        let information = information_in_world(&covariance, &Matrix3::identity(), DEFAULT_STD).unwrap();
         let expected = [4.0, 16.0, 100.0, 1.0, 0.25, 1.0 / 9.0];
         assert!((information.diagonal() - nalgebra::Vector6::from(expected)).norm() < 1e-12);
     }
@@ -143,8 +122,7 @@ mod tests {
 
     #[test]
     fn all_zero_means_the_default() {
-        let information =
-            information_in_world(&[[0.0; 6]; 6], &Matrix3::identity(), DEFAULT_STD).unwrap();
+        let information = information_in_world(&[[0.0; 6]; 6], &Matrix3::identity(), DEFAULT_STD).unwrap();
         assert!((information[(0, 0)] - 1e4).abs() < 1e-6);
         assert!((information[(3, 3)] - 2.5e5).abs() < 1e-6);
     }
@@ -166,14 +144,9 @@ mod tests {
     #[test]
     fn turning_the_header_frame_turns_the_information() {
         let covariance = diagonal([1.0, 4.0, 9.0, 0.25, 0.0625, 0.01]);
-        let rotation =
-            Rotation3::from_axis_angle(&nalgebra::Vector3::z_axis(), std::f64::consts::FRAC_PI_2);
-        let information =
-            information_in_world(&covariance, rotation.matrix(), DEFAULT_STD).unwrap();
-        assert!(
-            (information[(0, 0)] - 16.0).abs() < 1e-12,
-            "x of world is y of the header's frame"
-        );
+        let rotation = Rotation3::from_axis_angle(&nalgebra::Vector3::z_axis(), std::f64::consts::FRAC_PI_2);
+        let information = information_in_world(&covariance, rotation.matrix(), DEFAULT_STD).unwrap();
+        assert!((information[(0, 0)] - 16.0).abs() < 1e-12, "x of world is y of the header's frame");
         assert!((information[(4, 4)] - 1.0).abs() < 1e-12);
     }
 }

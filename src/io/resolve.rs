@@ -23,11 +23,7 @@ pub(super) struct Rejection {
 
 impl Rejection {
     pub fn new(stamp: Option<Stamp>, kind: &'static str, reason: String) -> Self {
-        Self {
-            stamp,
-            kind,
-            reason,
-        }
+        Self { stamp, kind, reason }
     }
 }
 
@@ -42,58 +38,24 @@ pub(super) struct WaitingMessage {
 /// What a message says, in its own frame.
 #[derive(Debug)]
 pub(super) enum Content {
-    Cloud {
-        source: usize,
-        points: Vec<SensorPoint>,
-    },
-    Wrench {
-        source: usize,
-        part: Option<Label>,
-        force: Vector3<f64>,
-        torque: Vector3<f64>,
-    },
-    Pose {
-        label: Label,
-        header_from_frame: Pose,
-        covariance: Box<[[f64; 6]; 6]>,
-    },
+    Cloud { source: usize, points: Vec<SensorPoint> },
+    Wrench { source: usize, part: Option<Label>, force: Vector3<f64>, torque: Vector3<f64> },
+    Pose { label: Label, header_from_frame: Pose, covariance: Box<[[f64; 6]; 6]> },
 }
 
 impl Content {
     /// A wrench on the object, whatever the sensor's sign.
-    pub fn wrench(
-        wrench: &Wrench,
-        source: usize,
-        config: &InputConfig,
-        stamp: Stamp,
-    ) -> Result<Self, Rejection> {
+    pub fn wrench(wrench: &Wrench, source: usize, config: &InputConfig, stamp: Stamp) -> Result<Self, Rejection> {
         let topic = config.wrenches.get(source);
-        let sign = if topic.is_some_and(|topic| topic.reaction) {
-            -1.0
-        } else {
-            1.0
-        };
+        let sign = if topic.is_some_and(|topic| topic.reaction) { -1.0 } else { 1.0 };
         let force = Vector3::from(wrench.force) * sign;
         let torque = Vector3::from(wrench.torque) * sign;
-        if !force
-            .iter()
-            .chain(&torque)
-            .all(|component| component.is_finite())
-        {
-            let reason = format!(
-                "force {:?}, torque {:?}: not finite",
-                force.as_slice(),
-                torque.as_slice()
-            );
+        if !force.iter().chain(&torque).all(|component| component.is_finite()) {
+            let reason = format!("force {:?}, torque {:?}: not finite", force.as_slice(), torque.as_slice());
             return Err(Rejection::new(Some(stamp), "not_finite", reason));
         }
         let part = topic.and_then(|topic| topic.part.label());
-        Ok(Self::Wrench {
-            source,
-            part,
-            force,
-            torque,
-        })
+        Ok(Self::Wrench { source, part, force, torque })
     }
 
     /// A pose; without a rotation if its covariance says that none was measured.
@@ -119,40 +81,23 @@ impl Content {
                 return Err(Rejection::new(Some(stamp), "bad_quaternion", reason));
             }
         };
-        Ok(Self::Pose {
-            label,
-            header_from_frame,
-            covariance: Box::new(message.covariance),
-        })
+        Ok(Self::Pose { label, header_from_frame, covariance: Box::new(message.covariance) })
     }
 }
 
 impl WaitingMessage {
     /// The message in world. `is_fixed`: its frame is the fixed frame itself, so that for a cloud
     /// it is not known where the sensor stood.
-    pub fn placed(
-        self,
-        world_from_frame: &Pose,
-        is_fixed: bool,
-        config: &InputConfig,
-    ) -> Result<Input, Rejection> {
+    pub fn placed(self, world_from_frame: &Pose, is_fixed: bool, config: &InputConfig) -> Result<Input, Rejection> {
         let stamp = self.stamp;
         Ok(match self.content {
             Content::Cloud { source, points } => Input::Cloud(SegmentedCloud {
                 stamp,
                 source,
                 viewpoint_in_world: (!is_fixed).then_some(world_from_frame.translation),
-                points: points
-                    .iter()
-                    .map(|point| in_world(point, world_from_frame))
-                    .collect(),
+                points: points.iter().map(|point| in_world(point, world_from_frame)).collect(),
             }),
-            Content::Wrench {
-                source,
-                part,
-                force,
-                torque,
-            } => Input::Wrench(AppliedWrench {
+            Content::Wrench { source, part, force, torque } => Input::Wrench(AppliedWrench {
                 stamp,
                 source,
                 part,
@@ -160,11 +105,7 @@ impl WaitingMessage {
                 force_in_world: world_from_frame.rotation * force,
                 torque_in_world: world_from_frame.rotation * torque,
             }),
-            Content::Pose {
-                label,
-                header_from_frame,
-                covariance,
-            } => Input::Pose(Box::new(MeasuredPose {
+            Content::Pose { label, header_from_frame, covariance } => Input::Pose(Box::new(MeasuredPose {
                 stamp,
                 label,
                 world_from_frame: *world_from_frame * header_from_frame,
@@ -175,10 +116,7 @@ impl WaitingMessage {
 }
 
 fn in_world(point: &SensorPoint, world_from_sensor: &Pose) -> LabelledPoint {
-    LabelledPoint {
-        point_in_world: world_from_sensor.transform_point(&point.point_in_sensor),
-        label: point.label,
-    }
+    LabelledPoint { point_in_world: world_from_sensor.transform_point(&point.point_in_sensor), label: point.label }
 }
 
 fn information(
@@ -187,10 +125,7 @@ fn information(
     config: &InputConfig,
     stamp: Stamp,
 ) -> Result<nalgebra::Matrix6<f64>, Rejection> {
-    let default_std = (
-        config.default_pose_std.rotation_rad,
-        config.default_pose_std.position_m,
-    );
+    let default_std = (config.default_pose_std.rotation_rad, config.default_pose_std.position_m);
     information_in_world(covariance, &world_from_header.rotation, default_std)
         .map_err(|error| Rejection::new(Some(stamp), "bad_covariance", error.to_string()))
 }

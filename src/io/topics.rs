@@ -84,28 +84,15 @@ impl MissingTopics {
             }
         };
         if !has_poses {
-            config
-                .clouds
-                .iter()
-                .for_each(|name| require(name, POINT_CLOUD_TYPE));
+            config.clouds.iter().for_each(|name| require(name, POINT_CLOUD_TYPE));
         }
-        config
-            .wrenches
-            .iter()
-            .for_each(|wrench| require(&wrench.topic, WRENCH_TYPE));
+        config.wrenches.iter().for_each(|wrench| require(&wrench.topic, WRENCH_TYPE));
         if missing.is_empty() && (has_clouds || has_poses) {
             return None;
         }
-        let present = bag
-            .topics
-            .iter()
-            .map(|(topic, _)| (topic.name.clone(), topic.type_name.clone()));
+        let present = bag.topics.iter().map(|(topic, _)| (topic.name.clone(), topic.type_name.clone()));
         let nothing_to_see = !has_clouds && !has_poses;
-        Some(Self {
-            missing,
-            present: present.collect(),
-            nothing_to_see,
-        })
+        Some(Self { missing, present: present.collect(), nothing_to_see })
     }
 }
 
@@ -115,19 +102,8 @@ impl fmt::Display for MissingTopics {
             true => "none".to_owned(),
             false => topics.join(", "),
         };
-        let missing = self
-            .missing
-            .iter()
-            .map(|(name, type_name)| format!("{name} ({type_name})"));
-        let present = self
-            .present
-            .iter()
-            .map(|(name, type_name)| format!("{name} ({type_name})"));
-        write!(
-            f,
-            "no messages on {}; the bag has: {}",
-            list(missing.collect()),
-            list(present.collect())
-        )
+        let missing = self.missing.iter().map(|(name, type_name)| format!("{name} ({type_name})"));
+        let present = self.present.iter().map(|(name, type_name)| format!("{name} ({type_name})"));
+        write!(f, "no messages on {}; the bag has: {}", list(missing.collect()), list(present.collect()))
     }
 }

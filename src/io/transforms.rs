@@ -46,9 +46,7 @@ pub enum TransformError {
         norm: f64,
     },
     /// The same stamp again, or one older than the history kept.
-    #[error(
-        "frame `{child}`: a transform of this stamp is already there, or newer ones by more than the history"
-    )]
+    #[error("frame `{child}`: a transform of this stamp is already there, or newer ones by more than the history")]
     Stale {
         /// Child.
         child: String,
@@ -152,10 +150,7 @@ struct Sample {
 impl TransformBuffer {
     /// Keeps `history_s` seconds of every dynamic link, counted back from its newest stamp.
     pub fn new(history_s: f64) -> Self {
-        Self {
-            history_ns: (history_s * 1e9) as i64,
-            links: BTreeMap::new(),
-        }
+        Self { history_ns: (history_s * 1e9) as i64, links: BTreeMap::new() }
     }
 
     /// Takes in one transform; `is_static` says that it holds at all times. A frame that changes
@@ -163,11 +158,7 @@ impl TransformBuffer {
     ///
     /// # Errors
     /// What is no transform, would close a ring, or is already there; the buffer is then unchanged.
-    pub fn insert(
-        &mut self,
-        transform: &TransformStamped,
-        is_static: bool,
-    ) -> Result<(), TransformError> {
+    pub fn insert(&mut self, transform: &TransformStamped, is_static: bool) -> Result<(), TransformError> {
         let parent = bare(&transform.header.frame_id).to_owned();
         let child = bare(&transform.child_frame_id).to_owned();
         if parent.is_empty() || child.is_empty() {
@@ -182,40 +173,25 @@ impl TransformBuffer {
         }
         let raw = transform.transform.rotation;
         let Some(rotation) = raw.unit() else {
-            return Err(TransformError::NotARotation {
-                child,
-                norm: raw.norm(),
-            });
+            return Err(TransformError::NotARotation { child, norm: raw.norm() });
         };
-        let sample = Sample {
-            stamp: transform.header.stamp.into(),
-            translation,
-            rotation,
-        };
+        let sample = Sample { stamp: transform.header.stamp.into(), translation, rotation };
         if is_static {
             let motion = Motion::Static(sample.pose());
             self.links.insert(child, Link { parent, motion });
             return Ok(());
         }
         match self.links.get_mut(&child) {
-            Some(Link {
-                parent: known,
-                motion: Motion::Dynamic(samples),
-            }) if *known == parent => {
+            Some(Link { parent: known, motion: Motion::Dynamic(samples) }) if *known == parent => {
                 let newest = samples.back().map_or(sample.stamp, |last| last.stamp);
                 let index = samples.partition_point(|other| other.stamp < sample.stamp);
-                let repeated = samples
-                    .get(index)
-                    .is_some_and(|other| other.stamp == sample.stamp);
+                let repeated = samples.get(index).is_some_and(|other| other.stamp == sample.stamp);
                 if repeated || newest.0.saturating_sub(sample.stamp.0) > self.history_ns {
                     return Err(TransformError::Stale { child });
                 }
                 samples.insert(index, sample);
                 let newest = newest.max(sample.stamp);
-                while samples
-                    .front()
-                    .is_some_and(|oldest| newest.0.saturating_sub(oldest.stamp.0) > self.history_ns)
-                {
+                while samples.front().is_some_and(|oldest| newest.0.saturating_sub(oldest.stamp.0) > self.history_ns) {
                     samples.pop_front();
                 }
             }
@@ -232,35 +208,21 @@ impl TransformBuffer {
     ///
     /// # Errors
     /// What is missing; [`LookupError::may_still_come`] says whether waiting can help.
-    pub fn lookup(
-        &self,
-        fixed_frame: &str,
-        frame: &str,
-        stamp: Stamp,
-    ) -> Result<Pose, LookupError> {
+    pub fn lookup(&self, fixed_frame: &str, frame: &str, stamp: Stamp) -> Result<Pose, LookupError> {
         let (fixed_frame, frame) = (bare(fixed_frame), bare(frame));
         if fixed_frame == frame {
             return Ok(Pose::identity());
         }
         let from_frame: Vec<&str> = self.path_to_root(frame).collect();
         let from_fixed: Vec<&str> = self.path_to_root(fixed_frame).collect();
-        let Some(common) = from_frame
-            .iter()
-            .copied()
-            .find(|ancestor| from_fixed.contains(ancestor))
-        else {
-            let known = self.links.contains_key(frame)
-                || self.links.values().any(|link| link.parent == frame);
+        let Some(common) = from_frame.iter().copied().find(|ancestor| from_fixed.contains(ancestor)) else {
+            let known = self.links.contains_key(frame) || self.links.values().any(|link| link.parent == frame);
             let root = from_frame.last().copied().unwrap_or(frame).to_owned();
             return Err(match known {
-                false => LookupError::UnknownFrame {
-                    frame: frame.to_owned(),
-                },
-                true => LookupError::NotConnected {
-                    frame: frame.to_owned(),
-                    fixed_frame: fixed_frame.to_owned(),
-                    root,
-                },
+                false => LookupError::UnknownFrame { frame: frame.to_owned() },
+                true => {
+                    LookupError::NotConnected { frame: frame.to_owned(), fixed_frame: fixed_frame.to_owned(), root }
+                }
             });
         };
         let common_from_frame = self.chain(&from_frame, common, stamp)?;
@@ -270,9 +232,7 @@ impl TransformBuffer {
 
     /// The frame itself, its parent, and so on up; ends, as `insert` admits no ring.
     fn path_to_root<'a>(&'a self, frame: &'a str) -> impl Iterator<Item = &'a str> {
-        std::iter::successors(Some(frame), |frame| {
-            self.links.get(*frame).map(|link| link.parent.as_str())
-        })
+        std::iter::successors(Some(frame), |frame| self.links.get(*frame).map(|link| link.parent.as_str()))
     }
 
     /// `ancestor_from_frame` for the first frame of `path`.
@@ -299,17 +259,13 @@ impl Link {
         match (before, after) {
             (_, Some(after)) if after.stamp == stamp => Ok(after.pose()),
             (Some(before), Some(after)) => Ok(before.interpolate(after, stamp).pose()),
-            (None, Some(after)) => Err(LookupError::TooOld {
-                frame: child.to_owned(),
-                by_ns: after.stamp.0.saturating_sub(stamp.0),
-            }),
-            (Some(before), None) => Err(LookupError::NotYet {
-                frame: child.to_owned(),
-                by_ns: stamp.0.saturating_sub(before.stamp.0),
-            }),
-            (None, None) => Err(LookupError::UnknownFrame {
-                frame: child.to_owned(),
-            }),
+            (None, Some(after)) => {
+                Err(LookupError::TooOld { frame: child.to_owned(), by_ns: after.stamp.0.saturating_sub(stamp.0) })
+            }
+            (Some(before), None) => {
+                Err(LookupError::NotYet { frame: child.to_owned(), by_ns: stamp.0.saturating_sub(before.stamp.0) })
+            }
+            (None, None) => Err(LookupError::UnknownFrame { frame: child.to_owned() }),
         }
     }
 }
@@ -345,10 +301,7 @@ mod tests {
 
     fn link(parent: &str, child: &str, stamp_s: f64, pose: Pose) -> TransformStamped {
         TransformStamped {
-            header: Header {
-                stamp: Stamp::default().plus_seconds(stamp_s).into(),
-                frame_id: parent.into(),
-            },
+            header: Header { stamp: Stamp::default().plus_seconds(stamp_s).into(), frame_id: parent.into() },
             child_frame_id: child.into(),
             transform: RawTransform::from(pose),
         }
@@ -368,15 +321,9 @@ mod tests {
         let base_from_camera = Pose::exp(&Vector6::new(-0.3, 0.1, 0.0, 0.0, 0.5, 1.0));
         let map_from_world = Pose::exp(&Vector6::new(0.0, 0.0, 1.0, 5.0, 0.0, 0.0));
         let mut buffer = TransformBuffer::new(10.0);
-        buffer
-            .insert(&link("world", "base", 0.0, world_from_base), true)
-            .unwrap();
-        buffer
-            .insert(&link("/base", "/camera", 0.0, base_from_camera), true)
-            .unwrap();
-        buffer
-            .insert(&link("map", "world", 0.0, map_from_world), true)
-            .unwrap();
+        buffer.insert(&link("world", "base", 0.0, world_from_base), true).unwrap();
+        buffer.insert(&link("/base", "/camera", 0.0, base_from_camera), true).unwrap();
+        buffer.insert(&link("map", "world", 0.0, map_from_world), true).unwrap();
         let found = buffer.lookup("world", "camera", at(99.0)).unwrap();
         assert!(distance(&found, &(world_from_base * base_from_camera)) < 1e-12);
         let found = buffer.lookup("world", "map", at(99.0)).unwrap();
@@ -394,9 +341,7 @@ mod tests {
         };
         let mut buffer = TransformBuffer::new(10.0);
         for stamp_s in [0.0, 2.0, 1.0] {
-            buffer
-                .insert(&link("world", "tool", stamp_s, pose(stamp_s)), false)
-                .unwrap();
+            buffer.insert(&link("world", "tool", stamp_s, pose(stamp_s)), false).unwrap();
         }
         for stamp_s in [0.0, 0.25, 1.0, 1.9, 2.0] {
             let found = buffer.lookup("world", "tool", at(stamp_s)).unwrap();
@@ -408,64 +353,32 @@ mod tests {
     fn nothing_is_extrapolated_and_nothing_is_assumed() {
         let mut buffer = TransformBuffer::new(10.0);
         let lookup = |buffer: &TransformBuffer, frame: &str, stamp_s| {
-            buffer
-                .lookup("world", frame, at(stamp_s))
-                .map_err(|error| (error.kind(), error.may_still_come()))
+            buffer.lookup("world", frame, at(stamp_s)).map_err(|error| (error.kind(), error.may_still_come()))
         };
         assert_eq!(lookup(&buffer, "world", 1.0), Ok(Pose::identity()));
         assert_eq!(lookup(&buffer, "tool", 1.0), Err(("unknown_frame", true)));
-        buffer
-            .insert(&link("base", "tool", 1.0, Pose::identity()), false)
-            .unwrap();
-        assert_eq!(
-            lookup(&buffer, "tool", 1.0),
-            Err(("frame_not_connected", true))
-        );
-        assert_eq!(
-            lookup(&buffer, "base", 1.0),
-            Err(("frame_not_connected", true))
-        );
-        buffer
-            .insert(&link("world", "base", 0.0, Pose::identity()), true)
-            .unwrap();
+        buffer.insert(&link("base", "tool", 1.0, Pose::identity()), false).unwrap();
+        assert_eq!(lookup(&buffer, "tool", 1.0), Err(("frame_not_connected", true)));
+        assert_eq!(lookup(&buffer, "base", 1.0), Err(("frame_not_connected", true)));
+        buffer.insert(&link("world", "base", 0.0, Pose::identity()), true).unwrap();
         assert_eq!(lookup(&buffer, "tool", 1.0), Ok(Pose::identity()));
         assert_eq!(lookup(&buffer, "tool", 1.1), Err(("no_recent_tf", true)));
         assert_eq!(lookup(&buffer, "tool", 0.9), Err(("older_than_tf", false)));
-        buffer
-            .insert(&link("base", "tool", 11.5, Pose::identity()), false)
-            .unwrap();
-        assert_eq!(
-            lookup(&buffer, "tool", 1.1),
-            Err(("older_than_tf", false)),
-            "history is 10 s"
-        );
+        buffer.insert(&link("base", "tool", 11.5, Pose::identity()), false).unwrap();
+        assert_eq!(lookup(&buffer, "tool", 1.1), Err(("older_than_tf", false)), "history is 10 s");
     }
 
     #[test]
     fn what_is_no_transform_leaves_the_buffer_as_it_was() {
         let mut buffer = TransformBuffer::new(10.0);
-        buffer
-            .insert(&link("world", "a", 20.0, Pose::identity()), false)
-            .unwrap();
-        buffer
-            .insert(&link("a", "b", 0.0, Pose::identity()), true)
-            .unwrap();
-        let mut refused =
-            |transform: TransformStamped| buffer.insert(&transform, false).unwrap_err().kind();
+        buffer.insert(&link("world", "a", 20.0, Pose::identity()), false).unwrap();
+        buffer.insert(&link("a", "b", 0.0, Pose::identity()), true).unwrap();
+        let mut refused = |transform: TransformStamped| buffer.insert(&transform, false).unwrap_err().kind();
         assert_eq!(refused(link("b", "world", 0.0, Pose::identity())), "ring");
         assert_eq!(refused(link("a", "a", 0.0, Pose::identity())), "ring");
-        assert_eq!(
-            refused(link("", "a", 0.0, Pose::identity())),
-            "empty_frame_name"
-        );
-        assert_eq!(
-            refused(link("world", "a", 20.0, Pose::identity())),
-            "repeated_or_old"
-        );
-        assert_eq!(
-            refused(link("world", "a", 9.9, Pose::identity())),
-            "repeated_or_old"
-        );
+        assert_eq!(refused(link("", "a", 0.0, Pose::identity())), "empty_frame_name");
+        assert_eq!(refused(link("world", "a", 20.0, Pose::identity())), "repeated_or_old");
+        assert_eq!(refused(link("world", "a", 9.9, Pose::identity())), "repeated_or_old");
         let mut bad = link("world", "a", 21.0, Pose::identity());
         bad.transform.rotation.w = 0.0;
         assert_eq!(refused(bad.clone()), "bad_quaternion");

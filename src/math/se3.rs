@@ -74,10 +74,7 @@ impl<T: Real> Pose<T> {
         let (a, b, c) = exponential_coefficients(theta_squared);
         let k = skew(&omega);
         let k_squared = k * k;
-        Self {
-            rotation: Matrix3::identity() + k * a + k_squared * b,
-            translation: v + k * v * b + k_squared * v * c,
-        }
+        Self { rotation: Matrix3::identity() + k * a + k_squared * b, translation: v + k * v * b + k_squared * v * c }
     }
 }
 
@@ -108,7 +105,8 @@ impl Pose<f64> {
 
     /// The same transform with R projected back onto the rotations (after many products).
     pub fn renormalized(&self) -> Self {
-        let rotation = Rotation3::from_matrix_eps(&self.rotation, 1e-12, 20, Rotation3::from_matrix_unchecked(self.rotation));
+        let rotation =
+            Rotation3::from_matrix_eps(&self.rotation, 1e-12, 20, Rotation3::from_matrix_unchecked(self.rotation));
         Self { rotation: rotation.into_inner(), translation: self.translation }
     }
 
@@ -195,11 +193,7 @@ fn exponential_coefficients<T: Real>(theta_squared: T) -> (T, T, T) {
     } else {
         let theta = theta_squared.sqrt();
         let (sin, cos) = theta.sin_cos();
-        (
-            sin / theta,
-            (T::one() - cos) / theta_squared,
-            (theta - sin) / (theta_squared * theta),
-        )
+        (sin / theta, (T::one() - cos) / theta_squared, (theta - sin) / (theta_squared * theta))
     }
 }
 

@@ -82,9 +82,7 @@ impl<'a, T: Real> WrenchTrack<'a, T> {
         let force = sample.force_in_world.map(T::constant) - self.force_bias;
         let torque = sample.torque_in_world.map(T::constant) - self.torque_bias;
         match self.point {
-            WrenchPoint::Recorded => {
-                Spatial::wrench_at(&sample.point_in_world.map(T::constant), force, &torque)
-            }
+            WrenchPoint::Recorded => Spatial::wrench_at(&sample.point_in_world.map(T::constant), force, &torque),
             WrenchPoint::Carried(_) => Spatial { angular: torque, linear: force },
         }
     }
@@ -139,9 +137,7 @@ mod tests {
         let samples = [sample(1.0, 0.0), sample(2.0, 4.0), sample(4.0, 0.0)];
         let mut track = WrenchTrack::new(0, &samples);
         let mut cursor = 0;
-        for (time_s, force) in
-            [(0.0, 0.0), (1.25, 1.0), (3.0, 2.0), (1.5, 2.0), (5.0, 0.0), (0.5, 0.0)]
-        {
+        for (time_s, force) in [(0.0, 0.0), (1.25, 1.0), (3.0, 2.0), (1.5, 2.0), (5.0, 0.0), (0.5, 0.0)] {
             assert_eq!(track.wrench(time_s, &mut cursor).force.x, force, "at {time_s}");
         }
         track.delay_s = 0.25;

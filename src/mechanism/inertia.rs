@@ -113,9 +113,8 @@ impl<T: Real> SpatialInertia<T> {
         let t = &pose.translation;
         let turned = rotation * self.first_moment;
         let cross = turned * t.transpose();
-        let mut about_origin =
-            rotation * self.about_origin * rotation.transpose() - cross - cross.transpose()
-                + parallel_axis(t, &(t * self.mass));
+        let mut about_origin = rotation * self.about_origin * rotation.transpose() - cross - cross.transpose()
+            + parallel_axis(t, &(t * self.mass));
         let diagonal = T::constant(2.0) * t.dot(&turned);
         for i in 0..3 {
             about_origin[(i, i)] += diagonal;
@@ -167,8 +166,7 @@ mod tests {
         let twist = Spatial::from(&Vector6::new(0.1, 0.2, 0.3, 0.4, 0.5, 0.6));
         let motion = Spatial::from(&Vector6::new(-0.5, 0.7, 0.1, 0.3, 0.9, -0.2));
         let wrench = Spatial::from(&Vector6::new(1.0, -2.0, 0.5, 0.8, 0.1, 3.0));
-        let sum =
-            twist.cross_motion(&motion).dot(&wrench) + motion.dot(&twist.cross_force(&wrench));
+        let sum = twist.cross_motion(&motion).dot(&wrench) + motion.dot(&twist.cross_force(&wrench));
         assert!(sum.abs() < 1e-14);
     }
 }

@@ -42,23 +42,13 @@ pub struct JointForces<T: Real> {
 impl<T: Real> JointParameters<T> {
     /// Damping \[N·s/m or N·m·s/rad\] and Coulomb friction \[N or N·m\], and nothing else.
     pub fn new(damping: T, friction: T) -> Self {
-        Self {
-            damping,
-            friction,
-            armature: T::zero(),
-            lower: None,
-            upper: None,
-            effects: Vec::new(),
-        }
+        Self { damping, friction, armature: T::zero(), lower: None, upper: None, effects: Vec::new() }
     }
 
     /// All that the joint does at this state.
     pub fn forces(&self, joint: &JointState<T>) -> JointForces<T> {
-        let declared = JointForces {
-            force: T::zero(),
-            damping: self.damping,
-            friction: FrictionBounds::symmetric(self.friction),
-        };
+        let declared =
+            JointForces { force: T::zero(), damping: self.damping, friction: FrictionBounds::symmetric(self.friction) };
         self.effects.iter().fold(declared, |forces, effect| effect.apply(joint, forces))
     }
 }

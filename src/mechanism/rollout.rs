@@ -67,9 +67,7 @@ pub fn rollout<T: Real>(
 ) -> Result<Trajectory<T>, RolloutError> {
     let carried = tracks.iter().any(|track| track.point != WrenchPoint::Recorded);
     match SingleJoint::of(tree) {
-        Some(joint) if !carried => {
-            rollout_single(tree, &joint, initial, tracks, times_s, step_max_s)
-        }
+        Some(joint) if !carried => rollout_single(tree, &joint, initial, tracks, times_s, step_max_s),
         _ => rollout_tree(tree, initial, tracks, times_s, step_max_s),
     }
 }
@@ -121,8 +119,7 @@ fn rollout_single<T: Real>(
     let mut trajectory = empty_trajectory(tree.body_count(), times_s.len());
     for (i, &end_s) in times_s.iter().enumerate() {
         for Step { middle_s, length_s } in steps(times_s, i, step_max_s) {
-            let applied =
-                drives.iter_mut().fold(T::zero(), |sum, drive| sum + drive.force(middle_s));
+            let applied = drives.iter_mut().fold(T::zero(), |sum, drive| sum + drive.force(middle_s));
             joint.step(&mut state, applied, middle_s, length_s);
         }
         if !(state.position.value().is_finite() && state.rate.value().is_finite()) {

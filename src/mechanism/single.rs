@@ -101,22 +101,16 @@ impl<'a, T: Real> SingleJoint<'a, T> {
         let half = T::constant(0.5 * step_s);
         let rate = state.rate;
         let middle = state.position + rate * half;
-        let joint = JointState {
-            position: middle,
-            rate: middle_rate(rate, state.rate_before),
-            time_s: middle_s,
-            step_s,
-        };
+        let joint =
+            JointState { position: middle, rate: middle_rate(rate, state.rate_before), time_s: middle_s, step_s };
         let forces = self.parameters.forces(&joint);
         let damping = ImplicitDamping::new(forces.damping, self.inertia, step_s);
-        let impulse = (self.inertia - damping.before) * rate
-            + (applied + self.gravity_force(middle) + forces.force) * h;
-        let approach =
-            Approach { position: state.position, rate, gained: rate - state.rate_before, step_s };
+        let impulse =
+            (self.inertia - damping.before) * rate + (applied + self.gravity_force(middle) + forces.force) * h;
+        let approach = Approach { position: state.position, rate, gained: rate - state.rate_before, step_s };
         let row = row(self.parameters, &forces, &approach);
         state.rate_before = rate;
         state.rate = row.proximal(self.inertia + damping.after, impulse, rate);
-        state.position =
-            row.limited_position(state.rate).unwrap_or_else(|| middle + state.rate * half);
+        state.position = row.limited_position(state.rate).unwrap_or_else(|| middle + state.rate * half);
     }
 }

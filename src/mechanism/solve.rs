@@ -47,13 +47,7 @@ const ROUNDING: f64 = 1e-13;
 
 /// Solves for the rates in place; on entry `rates` are those before the step. `a` is symmetric
 /// positive definite, row by row. `rows` are used up.
-pub(super) fn solve<T: Real>(
-    a: &[T],
-    b: &[T],
-    rows: &mut [Row<T>],
-    rates: &mut [T],
-    scratch: &mut SolveScratch<T>,
-) {
+pub(super) fn solve<T: Real>(a: &[T], b: &[T], rows: &mut [Row<T>], rates: &mut [T], scratch: &mut SolveScratch<T>) {
     if let [row] = rows {
         rates[0] = row.proximal(a[0], b[0], rates[0]);
         return;
@@ -64,13 +58,7 @@ pub(super) fn solve<T: Real>(
     share_friction_of_turning(a, b, rows, rates, scratch);
 }
 
-fn find_regimes<T: Real>(
-    a: &[T],
-    b: &[T],
-    rows: &[Row<T>],
-    rates: &mut [T],
-    scratch: &mut SolveScratch<T>,
-) {
+fn find_regimes<T: Real>(a: &[T], b: &[T], rows: &[Row<T>], rates: &mut [T], scratch: &mut SolveScratch<T>) {
     let n = rows.len();
     // Joints go on as they did: most steps need no search.
     scratch.regimes.clear();
@@ -142,12 +130,10 @@ fn share_friction_of_turning<T: Real>(
     scratch: &mut SolveScratch<T>,
 ) {
     let n = rows.len();
-    let arrives = |j: usize, scratch: &SolveScratch<T>| {
-        scratch.regimes[j] == Regime::Sticks && scratch.before[j].value() != 0.0
-    };
+    let arrives =
+        |j: usize, scratch: &SolveScratch<T>| scratch.regimes[j] == Regime::Sticks && scratch.before[j].value() != 0.0;
     let turns = |j: usize, scratch: &SolveScratch<T>| {
-        scratch.before[j].value() != 0.0
-            && scratch.regimes[j] == Regime::turned_from(scratch.before[j].value())
+        scratch.before[j].value() != 0.0 && scratch.regimes[j] == Regime::turned_from(scratch.before[j].value())
     };
     let mut any_turns = (0..n).any(|j| turns(j, scratch));
     if (0..n).any(|j| arrives(j, scratch)) {
@@ -182,10 +168,7 @@ fn share_friction_of_turning<T: Real>(
             let share = share_before_turning(before, rates[j]);
             let FrictionBounds { against_plus, against_minus } = rows[j].friction;
             let sum = (against_plus + against_minus) * share;
-            rows[j].friction = FrictionBounds {
-                against_plus: against_plus - sum,
-                against_minus: against_minus - sum,
-            };
+            rows[j].friction = FrictionBounds { against_plus: against_plus - sum, against_minus: against_minus - sum };
             scratch.regimes[j] = scratch.regimes[j].reversed();
         }
     }
@@ -208,13 +191,7 @@ fn guess<T: Real>(row: &Row<T>, rate: f64) -> Regime {
 }
 
 /// b_j − Σ_{k ≠ j} A_jk v_k and the size of its terms.
-fn impulse_on<T: Real>(
-    j: usize,
-    n: usize,
-    a: &[T],
-    b: &[T],
-    rate: impl Fn(usize) -> f64,
-) -> (f64, f64) {
+fn impulse_on<T: Real>(j: usize, n: usize, a: &[T], b: &[T], rate: impl Fn(usize) -> f64) -> (f64, f64) {
     let mut impulse = b[j].value();
     let mut size = impulse.abs();
     for k in (0..n).filter(|&k| k != j) {
@@ -226,31 +203,18 @@ fn impulse_on<T: Real>(
 }
 
 /// Whether every joint's rate is what its own law gives under all the others.
-fn is_settled<T: Real>(
-    a: &[T],
-    b: &[T],
-    rows: &[Row<T>],
-    rates: &[T],
-    scratch: &SolveScratch<T>,
-) -> bool {
+fn is_settled<T: Real>(a: &[T], b: &[T], rows: &[Row<T>], rates: &[T], scratch: &SolveScratch<T>) -> bool {
     let n = rows.len();
     (0..n).all(|j| {
         let diagonal = a[j * n + j].value();
         let (impulse, size) = impulse_on(j, n, a, b, |k| rates[k].value());
         let (value, regime) = rows[j].proximal_value(diagonal, impulse);
-        regime == scratch.regimes[j]
-            || (value - rates[j].value()).abs() * diagonal <= ROUNDING * size
+        regime == scratch.regimes[j] || (value - rates[j].value()).abs() * diagonal <= ROUNDING * size
     })
 }
 
 /// The rates if the regimes are right: fixed for stuck and limited joints, linear for the others.
-fn solve_regimes<T: Real>(
-    a: &[T],
-    b: &[T],
-    rows: &[Row<T>],
-    rates: &mut [T],
-    scratch: &mut SolveScratch<T>,
-) {
+fn solve_regimes<T: Real>(a: &[T], b: &[T], rows: &[Row<T>], rates: &mut [T], scratch: &mut SolveScratch<T>) {
     let n = rows.len();
     let SolveScratch { regimes, slipping, factor, right, .. } = scratch;
     slipping.clear();
@@ -325,11 +289,7 @@ mod tests {
 
     fn row(friction: f64, least: Option<f64>, greatest: Option<f64>) -> Row<f64> {
         let flow = |rate| LimitFlow { rate, position: 0.0 };
-        Row {
-            friction: FrictionBounds::symmetric(friction),
-            least: least.map(flow),
-            greatest: greatest.map(flow),
-        }
+        Row { friction: FrictionBounds::symmetric(friction), least: least.map(flow), greatest: greatest.map(flow) }
     }
 
     proptest! {

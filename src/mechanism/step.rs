@@ -103,8 +103,7 @@ pub fn step<T: Real>(
     workspace.rows.clear();
     for (k, &body) in tree.moving.iter().enumerate() {
         let rate = workspace.rates[k];
-        let momentum = (0..n)
-            .fold(T::zero(), |sum, j| sum + workspace.mass_matrix[k * n + j] * workspace.rates[j]);
+        let momentum = (0..n).fold(T::zero(), |sum, j| sum + workspace.mass_matrix[k * n + j] * workspace.rates[j]);
         let applied = workspace.applied[k] - workspace.bias[k];
         let parameters = &tree.bodies()[body].parameters;
         let joint = JointState {
@@ -114,10 +113,8 @@ pub fn step<T: Real>(
             step_s: step.length_s,
         };
         let forces = parameters.forces(&joint);
-        let damping =
-            ImplicitDamping::new(forces.damping, workspace.mass_matrix[k * n + k], step.length_s);
-        workspace.applied[k] = momentum - damping.before * rate
-            + (applied + forces.force) * T::constant(step.length_s);
+        let damping = ImplicitDamping::new(forces.damping, workspace.mass_matrix[k * n + k], step.length_s);
+        workspace.applied[k] = momentum - damping.before * rate + (applied + forces.force) * T::constant(step.length_s);
         let approach = Approach {
             position: state.positions[body],
             rate,
@@ -135,26 +132,19 @@ pub fn step<T: Real>(
     solve(mass_matrix, applied, rows, rates, scratch);
     for (k, &body) in tree.moving.iter().enumerate() {
         let rate = workspace.rates[k];
-        state.positions[body] = workspace.rows[k]
-            .limited_position(rate)
-            .unwrap_or_else(|| workspace.middle[body] + rate * half);
+        state.positions[body] =
+            workspace.rows[k].limited_position(rate).unwrap_or_else(|| workspace.middle[body] + rate * half);
         state.rates_before[body] = state.rates[body];
         state.rates[body] = rate;
     }
 }
 
-fn apply_wrenches<T: Real>(
-    tree: &Tree<T>,
-    wrenches: &[BodyWrench<T>],
-    workspace: &mut Workspace<T>,
-) {
+fn apply_wrenches<T: Real>(tree: &Tree<T>, wrenches: &[BodyWrench<T>], workspace: &mut Workspace<T>) {
     workspace.applied.fill(T::zero());
     for wrench in wrenches {
         let point = match wrench.point {
             WrenchOrigin::World(point) => point,
-            WrenchOrigin::Carried(point) => {
-                tree.displacement(wrench.body, workspace).transform_point(&point)
-            }
+            WrenchOrigin::Carried(point) => tree.displacement(wrench.body, workspace).transform_point(&point),
         };
         let about_origin = Spatial::wrench_at(&point, wrench.force, &wrench.torque);
         let Workspace { screws, applied, .. } = workspace;
@@ -171,11 +161,7 @@ pub(super) fn middle_rate<T: Real>(rate: T, before: T) -> T {
 
 /// The friction interval and the limits of one joint, as impulses and rates of this step.
 #[inline]
-pub(super) fn row<T: Real>(
-    parameters: &JointParameters<T>,
-    forces: &JointForces<T>,
-    approach: &Approach<T>,
-) -> Row<T> {
+pub(super) fn row<T: Real>(parameters: &JointParameters<T>, forces: &JointForces<T>, approach: &Approach<T>) -> Row<T> {
     let h = T::constant(approach.step_s);
     Row {
         friction: FrictionBounds {

@@ -11,12 +11,7 @@ use crate::math::{Pose, Real, Screw};
 const GRAVITY: Vector3<f64> = Vector3::new(0.0, 0.0, -9.81);
 
 /// A chain or a fork of bodies from plain numbers, eleven to a body.
-fn tree_of<T: Real>(
-    numbers: &[f64],
-    parents: &[Option<usize>],
-    frame: &Pose<f64>,
-    gravity: Vector3<f64>,
-) -> Tree<T> {
+fn tree_of<T: Real>(numbers: &[f64], parents: &[Option<usize>], frame: &Pose<f64>, gravity: Vector3<f64>) -> Tree<T> {
     let bodies = numbers
         .chunks_exact(11)
         .zip(parents)
@@ -25,8 +20,7 @@ fn tree_of<T: Real>(
             let point = Vector3::new(x[3], x[4], x[5]);
             let com = point + Vector3::new(x[6], x[7], x[8]);
             let turns = x[9] > 0.0;
-            let screw =
-                if turns { Screw::revolute(&axis, &point) } else { Screw::prismatic(&axis) };
+            let screw = if turns { Screw::revolute(&axis, &point) } else { Screw::prismatic(&axis) };
             let size = Vector3::new(0.2 + x[6].abs(), 0.3, 0.2 + x[7].abs());
             let about_com = Matrix3::from_diagonal(&size) + size * size.transpose() * 0.1;
             let turned = frame.rotation * about_com * frame.rotation.transpose();
@@ -263,8 +257,7 @@ fn a_limit_stops_the_joint_and_holds_it() {
         let samples = [push(0.0, -20.0)];
         let times: Vec<f64> = (0..200).map(|i| i as f64 * 0.01).collect();
         let tracks = [WrenchTrack::new(0, &samples)];
-        let run =
-            rollout(&tree, &State::new(vec![0.1], vec![0.0]), &tracks, &times, step_s).unwrap();
+        let run = rollout(&tree, &State::new(vec![0.1], vec![0.0]), &tracks, &times, step_s).unwrap();
         let deepest = (0..200).map(|i| run.positions(i)[0]).fold(f64::INFINITY, f64::min);
         // Arrives with √(2 · 10 · .15) = 1.7 m/s; critically damped: depth v T / e = 6.4 mm.
         assert!(deepest > -0.05 - 0.01, "{deepest} at step {step_s}");

@@ -212,8 +212,7 @@ impl<T: Real> Tree<T> {
         mass_matrix.fill(T::zero());
         for k in (0..n).rev() {
             let momentum = composites[k].momentum(&screws[k]);
-            mass_matrix[k * n + k] =
-                screws[k].dot(&momentum) + self.bodies[self.moving[k]].parameters.armature;
+            mass_matrix[k * n + k] = screws[k].dot(&momentum) + self.bodies[self.moving[k]].parameters.armature;
             let mut ancestor = self.parents[k];
             if let Some(parent) = ancestor {
                 let composite = composites[k];
@@ -232,8 +231,7 @@ impl<T: Real> Tree<T> {
     /// per moving joint.
     pub(super) fn update_bias(&self, rates: &[T], workspace: &mut Workspace<T>) {
         let Workspace { screws, inertias, twists, accelerations, forces, bias, .. } = workspace;
-        let upward =
-            Spatial { angular: Vector3::zeros(), linear: self.gravity.map(|g| T::constant(-g)) };
+        let upward = Spatial { angular: Vector3::zeros(), linear: self.gravity.map(|g| T::constant(-g)) };
         for k in 0..self.moving.len() {
             let (twist, acceleration) = match self.parents[k] {
                 Some(parent) => (twists[parent], accelerations[parent]),
@@ -242,8 +240,8 @@ impl<T: Real> Tree<T> {
             let own = screws[k] * rates[k];
             twists[k] = twist + own;
             accelerations[k] = acceleration + twist.cross_motion(&own);
-            forces[k] = inertias[k].momentum(&accelerations[k])
-                + twists[k].cross_force(&inertias[k].momentum(&twists[k]));
+            forces[k] =
+                inertias[k].momentum(&accelerations[k]) + twists[k].cross_force(&inertias[k].momentum(&twists[k]));
         }
         for k in (0..self.moving.len()).rev() {
             bias[k] = screws[k].dot(&forces[k]);
@@ -256,13 +254,7 @@ impl<T: Real> Tree<T> {
 
     /// Adds a world wrench on `body` to the generalized forces: τ_j += S_j(q)ᵀ w for every moving
     /// ancestor j, from the kinematics in the workspace; `forces` one per moving joint.
-    pub(super) fn project_wrench(
-        &self,
-        body: usize,
-        wrench: &Spatial<T>,
-        screws: &[Spatial<T>],
-        forces: &mut [T],
-    ) {
+    pub(super) fn project_wrench(&self, body: usize, wrench: &Spatial<T>, screws: &[Spatial<T>], forces: &mut [T]) {
         let mut joint = self.carriers[body];
         while let Some(k) = joint {
             forces[k] += screws[k].dot(wrench);

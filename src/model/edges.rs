@@ -49,7 +49,11 @@ pub struct EdgeFit {
 }
 
 /// The windows seen from a parent that moves along `track` (by window and frame).
-pub fn relative_windows(child: Label, track: Option<&[Vec<Pose>]>, windows: &[&WindowObservations]) -> Vec<WindowObservations> {
+pub fn relative_windows(
+    child: Label,
+    track: Option<&[Vec<Pose>]>,
+    windows: &[&WindowObservations],
+) -> Vec<WindowObservations> {
     windows
         .iter()
         .enumerate()
@@ -79,7 +83,11 @@ pub fn relative_windows(child: Label, track: Option<&[Vec<Pose>]>, windows: &[&W
                     .filter(|c| c.label == child)
                     .map(|c| Contact {
                         label: child,
-                        track: c.track.iter().map(|(k, x, s)| (*k, reference(*k).transform_point(x), s.hypot(blur))).collect(),
+                        track: c
+                            .track
+                            .iter()
+                            .map(|(k, x, s)| (*k, reference(*k).transform_point(x), s.hypot(blur)))
+                            .collect(),
                     })
                     .collect(),
                 ..WindowObservations::default()
@@ -155,7 +163,8 @@ pub fn axes_from_motion(part: &EdgePart, joint_type: JointType, windows: &[Windo
     let place = |d: &Pose| (d.transform_point(&part.center), d.rotation);
     let mut best: Option<(f64, Pose, Pose)> = None;
     for window in windows {
-        let measured: Vec<Pose> = window.poses.get(&part.label).into_iter().flatten().flatten().map(|m| m.displacement).collect();
+        let measured: Vec<Pose> =
+            window.poses.get(&part.label).into_iter().flatten().flatten().map(|m| m.displacement).collect();
         for first in measured.iter().step_by((measured.len() / 6).max(1)) {
             for second in &measured {
                 let ((p, r), (q, s)) = (place(first), place(second));
@@ -169,7 +178,9 @@ pub fn axes_from_motion(part: &EdgePart, joint_type: JointType, windows: &[Windo
     let Some((_, first, second)) = best else { return Vec::new() };
     let shift = second.transform_point(&part.center) - first.transform_point(&part.center);
     match joint_type {
-        JointType::Prismatic => shift.try_normalize(1e-6).map(|direction| Axis { direction, point: part.center }).into_iter().collect(),
+        JointType::Prismatic => {
+            shift.try_normalize(1e-6).map(|direction| Axis { direction, point: part.center }).into_iter().collect()
+        }
         JointType::Revolute => {
             // Screw of the motion between the two frames, in the parent's frame at reference.
             let twist = (second * first.inverse()).log();

@@ -225,17 +225,16 @@ pub fn fit_kinematics(
             problem.tie_rests();
             tied = true;
             converged = false;
-            cost = problem.cost();
         }
         let systems = problem.linearize();
         problem.weigh_alignments(&systems);
-        cost = problem.cost();
+        let cost_before = problem.cost();
         let mut accepted = false;
         for _ in 0..6 {
             let trial = problem.stepped(&systems, damping);
             let trial_cost = trial.cost();
-            if trial_cost.is_finite() && trial_cost <= cost + 1e-9 {
-                converged = cost - trial_cost < 1e-6 * (1.0 + cost.abs());
+            if trial_cost.is_finite() && trial_cost <= cost_before + 1e-9 {
+                converged = cost_before - trial_cost < 1e-6 * (1.0 + cost_before.abs());
                 problem = trial;
                 cost = trial_cost;
                 damping = (damping * 0.2_f64).max(1e-9);
@@ -263,6 +262,9 @@ struct WindowSystem {
     global_gradient: DVector<f64>,
 }
 
+/// By window, joint, frame and faces: the information of a measurement.
+type FaceInformation = Vec<Vec<Vec<[Option<Matrix6<f64>>; 2]>>>;
+
 #[derive(Clone)]
 struct Problem<'a> {
     joints: Vec<KinematicJoint>,
@@ -274,7 +276,7 @@ struct Problem<'a> {
     /// By window: how many local position unknowns.
     slot_counts: Vec<usize>,
     /// By window, joint, frame: information after the error that frames at one pose share.
-    information: Rc<Vec<Vec<Vec<[Option<Matrix6<f64>>; 2]>>>>,
+    information: Rc<FaceInformation>,
     /// By joint, as ξ about the center: the rigid error of the first look's faces away from where they
     /// were first seen, and that of the faces that came into view later.
     face_errors: Vec<[Vector6<f64>; 2]>,
@@ -350,7 +352,7 @@ impl<'a> Problem<'a> {
     }
 
     /// Information of every measurement, given how many frames share its registration error.
-    fn informations(&self, sharing: impl Fn(usize, usize, usize) -> f64) -> Vec<Vec<Vec<[Option<Matrix6<f64>>; 2]>>> {
+    fn informations(&self, sharing: impl Fn(usize, usize, usize) -> f64) -> FaceInformation {
         let one = |w: usize, j: usize, frame: usize, face: usize| {
             let joint = &self.joints[j];
             let raw = self.measured(w, j, frame, face)?.information;
@@ -427,8 +429,8 @@ impl<'a> Problem<'a> {
         for (w, window) in self.windows.iter().enumerate() {
             for frame in 0..window.times_s.len() {
                 let displacements = forward(&self.joints, |j| self.positions[w][j][frame]);
-                for j in 0..self.joints.len() {
-                    for (_, r, information) in self.residuals(w, j, frame, &displacements[j]) {
+                for (j, displacement) in displacements.iter().enumerate() {
+                    for (_, r, information) in self.residuals(w, j, frame, displacement) {
                         cost += self.student_cost(r.dot(&(information * r)), 6.0);
                     }
                 }

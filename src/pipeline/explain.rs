@@ -11,10 +11,12 @@ use nalgebra::{Matrix6, Vector3, Vector6};
 
 use crate::math::{Pose, Screw};
 use crate::mechanism::JointType;
-use crate::model::{Axis, Contact, KinematicJoint, KinematicSettings, PoseMeasurement, WindowObservations, fit_kinematics};
+use crate::model::{
+    Axis, Contact, KinematicJoint, KinematicSettings, PoseMeasurement, WindowObservations, fit_kinematics,
+};
 use crate::registration::{
-    AlignmentSettings, AxisSeed, JointFrame, JointPath, OUTLIER_COST, PartModel, Quadratic, ScanPoint, fit_circle, fit_line,
-    geometric_seeds, pose_factor, search_path, truncated_cost,
+    AlignmentSettings, AxisSeed, JointFrame, JointPath, OUTLIER_COST, PartModel, Quadratic, ScanPoint, fit_circle,
+    fit_line, geometric_seeds, pose_factor, search_path, truncated_cost,
 };
 use crate::types::Label;
 
@@ -100,7 +102,8 @@ pub fn explain_window(scene: &Scene<'_>) -> BTreeMap<Label, Motion> {
         let mut best: Option<(f64, usize, Motion)> = None;
         for (index, &label) in open.iter().enumerate() {
             let Some(motion) = scene.best_motion(label, &motions) else { continue };
-            let score = motion.excess + 0.05 * (scene.tool_miss(label, &motion.displacements) / TOOL_EXPLAINED).min(20.0);
+            let score =
+                motion.excess + 0.05 * (scene.tool_miss(label, &motion.displacements) / TOOL_EXPLAINED).min(20.0);
             if best.as_ref().is_none_or(|(other, _, _)| score < *other) {
                 best = Some((score, index, motion));
             }
@@ -263,7 +266,14 @@ impl Scene<'_> {
         self.evaluate(label, |k| parents[k] * screw.displacement(path.positions[k]))
     }
 
-    fn path(&self, label: Label, screw: &Screw, joint_type: JointType, parents: &[Pose], contact_point: Option<&Vector3<f64>>) -> JointPath {
+    fn path(
+        &self,
+        label: Label,
+        screw: &Screw,
+        joint_type: JointType,
+        parents: &[Pose],
+        contact_point: Option<&Vector3<f64>>,
+    ) -> JointPath {
         let model = &self.models[&label];
         let grid = match joint_type {
             JointType::Prismatic => (-0.6, 0.6, 0.010),
@@ -281,7 +291,8 @@ impl Scene<'_> {
         if let Some(contact) = self.contact(label) {
             let track: Vec<Vector3<f64>> =
                 contact.track.iter().map(|(k, x, _)| parents[*k].inverse().transform_point(x)).collect();
-            let mut seeds: Vec<(AxisSeed, f64)> = [fit_line(&track), fit_circle(&track)].into_iter().flatten().collect();
+            let mut seeds: Vec<(AxisSeed, f64)> =
+                [fit_line(&track), fit_circle(&track)].into_iter().flatten().collect();
             seeds.sort_by(|a, b| a.1.total_cmp(&b.1));
             return seeds.into_iter().map(|(seed, _)| seed).collect();
         }
@@ -318,7 +329,10 @@ impl Scene<'_> {
             parent: None,
             child: label,
             joint_type,
-            axis: Axis { direction: seed.direction, point: point + seed.direction * seed.direction.dot(&(center - point)) },
+            axis: Axis {
+                direction: seed.direction,
+                point: point + seed.direction * seed.direction.dot(&(center - point)),
+            },
             center,
             radius: model.radius,
             suggested: None,
@@ -386,7 +400,12 @@ impl Best {
 
 /// A scan's pose near `predicted`: the Gauss–Newton optimum of what the scan holds, with its
 /// information; directions that nothing holds stay as predicted.
-pub fn measure(model: &PartModel, scan: &[ScanPoint], predicted: &Pose, settings: &AlignmentSettings) -> Option<PoseMeasurement> {
+pub fn measure(
+    model: &PartModel,
+    scan: &[ScanPoint],
+    predicted: &Pose,
+    settings: &AlignmentSettings,
+) -> Option<PoseMeasurement> {
     if scan.len() < FEWEST_POINTS {
         return None;
     }
@@ -399,7 +418,12 @@ pub fn measure(model: &PartModel, scan: &[ScanPoint], predicted: &Pose, settings
 }
 
 /// As `measure`, apart for the faces of the first look and for those that came into view later.
-pub fn measure_faces(model: &PartModel, scan: &[ScanPoint], predicted: &Pose, settings: &AlignmentSettings) -> [Option<PoseMeasurement>; 2] {
+pub fn measure_faces(
+    model: &PartModel,
+    scan: &[ScanPoint],
+    predicted: &Pose,
+    settings: &AlignmentSettings,
+) -> [Option<PoseMeasurement>; 2] {
     if scan.len() < FEWEST_POINTS {
         return [None; 2];
     }
@@ -413,7 +437,8 @@ pub fn measure_faces(model: &PartModel, scan: &[ScanPoint], predicted: &Pose, se
 /// The pose measurement of a factor taken at `predicted`.
 pub fn measurement_of(model: &PartModel, factor: &Quadratic, predicted: &Pose) -> PoseMeasurement {
     let information = factor.information(model.radius, FALSE_SHARE);
-    let weak = Vector6::new(model.radius, model.radius, model.radius, 1.0, 1.0, 1.0).map(|s| s * s / MEASURED_WITHIN.powi(2));
+    let weak =
+        Vector6::new(model.radius, model.radius, model.radius, 1.0, 1.0, 1.0).map(|s| s * s / MEASURED_WITHIN.powi(2));
     let step = (information + Matrix6::from_diagonal(&weak))
         .cholesky()
         .map_or_else(Vector6::zeros, |c| -c.solve(&factor.gradient));

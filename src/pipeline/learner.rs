@@ -5,15 +5,17 @@ use std::collections::{BTreeMap, BTreeSet};
 use nalgebra::{DMatrix, Vector3};
 
 use super::explain::{Baseline, Frame, Motion, Scene, explain_window, measure_faces, travel};
+use crate::geometry::{HullProperties, hull_properties};
 use crate::math::Pose;
 use crate::mechanism::JointType;
-use crate::geometry::{HullProperties, hull_properties};
-use crate::model::{DynamicsInput, DynamicsLearner, WindowInference};
 use crate::model::{
-    Axis, Contact, EdgeFit, EdgePart, KinematicFit, KinematicJoint, KinematicSettings, WindowObservations, axes_from_motion,
-    fit_kinematics, moving_evidence, relative_windows, rigid_evidence,
+    Axis, Contact, EdgeFit, EdgePart, KinematicFit, KinematicJoint, KinematicSettings, WindowObservations,
+    axes_from_motion, fit_kinematics, moving_evidence, relative_windows, rigid_evidence,
 };
-use crate::registration::{AlignmentSettings, PartModel, ScanPoint, Surfel, SurfelAccumulator, fit_circle, fit_line, truncated_cost};
+use crate::model::{DynamicsInput, DynamicsLearner, WindowInference};
+use crate::registration::{
+    AlignmentSettings, PartModel, ScanPoint, Surfel, SurfelAccumulator, fit_circle, fit_line, truncated_cost,
+};
 use crate::structure::TreeDistribution;
 use crate::types::{AppliedWrench, Label};
 
@@ -99,7 +101,8 @@ pub struct Learner {
 impl Learner {
     /// Nothing learned yet: models from the scans accumulated at the reference configuration.
     pub fn new(root: Label, use_tool: bool, accumulators: BTreeMap<Label, SurfelAccumulator>) -> Self {
-        let reference: BTreeMap<Label, Vec<Surfel>> = accumulators.iter().map(|(label, a)| (*label, a.surfels())).collect();
+        let reference: BTreeMap<Label, Vec<Surfel>> =
+            accumulators.iter().map(|(label, a)| (*label, a.surfels())).collect();
         let gaps = surface_gaps(&reference);
         let models = reference.iter().filter_map(|(label, s)| Some((*label, PartModel::new(s, &[])?))).collect();
         Self {
@@ -165,7 +168,7 @@ impl Learner {
         for (label, motion) in &motions {
             tracing::debug!(%label, moved = motion.moved, excess = motion.excess, seed = ?motion.seed, "motion");
         }
-        let mut observations = WindowObservations {
+        let observations = WindowObservations {
             times_s: job.frames.iter().map(|f| f.time_s).collect(),
             contacts: if self.use_tool { job.contacts.clone() } else { Vec::new() },
             wrenches: job.wrenches.clone(),
@@ -206,7 +209,13 @@ impl Learner {
         }
         let Some(fit) = &self.fit else { return };
         let windows: Vec<&WindowObservations> = self.windows.iter().collect();
-        let input = DynamicsInput { windows: &windows, contacts: &job.contacts, zero: job.zero, parts: &self.hulls, use_tool: self.use_tool };
+        let input = DynamicsInput {
+            windows: &windows,
+            contacts: &job.contacts,
+            zero: job.zero,
+            parts: &self.hulls,
+            use_tool: self.use_tool,
+        };
         self.inferences.push(self.dynamics.learn_window(fit, &input));
     }
 
@@ -292,7 +301,12 @@ impl Learner {
     }
 
     /// The evidence so far, where neither part moved in the window: it adds the same to every type.
-    fn unaffected(&self, child: Label, parent: Option<Label>, motions: &BTreeMap<Label, Motion>) -> Option<ParentEvidence> {
+    fn unaffected(
+        &self,
+        child: Label,
+        parent: Option<Label>,
+        motions: &BTreeMap<Label, Motion>,
+    ) -> Option<ParentEvidence> {
         let moved = |label: Label| motions.get(&label).is_some_and(|m| m.moved);
         if moved(child) || parent.is_some_and(moved) {
             return None;
@@ -514,7 +528,7 @@ impl Learner {
 }
 
 /// Diagonal of a track's bounding box \[m\].
-fn extent(track: &Vec<Vector3<f64>>) -> f64 {
+fn extent(track: &[Vector3<f64>]) -> f64 {
     let low = track.iter().fold(Vector3::repeat(f64::INFINITY), |low, x| low.inf(x));
     let high = track.iter().fold(Vector3::repeat(f64::NEG_INFINITY), |high, x| high.sup(x));
     if track.is_empty() { 0.0 } else { (high - low).norm() }
@@ -532,7 +546,8 @@ fn surface_gaps(parts: &BTreeMap<Label, Vec<Surfel>>) -> BTreeMap<(Label, Label)
     let mut gaps = BTreeMap::new();
     for (first, surfels) in parts {
         for (second, others) in parts.range((std::ops::Bound::Excluded(*first), std::ops::Bound::Unbounded)) {
-            let nearest = |s: &Surfel| others.iter().map(|o| (o.point - s.point).norm_squared()).fold(f64::INFINITY, f64::min);
+            let nearest =
+                |s: &Surfel| others.iter().map(|o| (o.point - s.point).norm_squared()).fold(f64::INFINITY, f64::min);
             let every = (surfels.len() / 400).max(1);
             let gap = surfels.iter().step_by(every).map(nearest).fold(f64::INFINITY, f64::min).sqrt();
             gaps.insert((*first, *second), gap);

@@ -19,8 +19,8 @@ use crate::math::Pose;
 use crate::model::{DynamicsLearner, KinematicSettings, PoseMeasurement};
 use crate::registration::{AlignmentSettings, Quadratic, SurfelAccumulator, align, truncated_cost};
 use crate::types::{Input, Label, Stamp};
-use forecast::Forecaster;
 use explain::{FEWEST_POINTS, measurement_of, travel};
+use forecast::Forecaster;
 use windows::frame_of;
 use working_frame::WorkingFrame;
 
@@ -50,6 +50,7 @@ pub struct PipelineSettings {
 
 /// What the pipeline says.
 #[derive(Clone, Debug)]
+#[expect(clippy::large_enum_variant, reason = "an output is moved once, to whoever writes it; most are the large ones")]
 pub enum Output {
     /// A part as registration measured it in one frame.
     Observation {
@@ -158,9 +159,8 @@ impl Pipeline {
     }
 
     fn push_frame(&mut self, stamp: Stamp, clouds: &[crate::types::SegmentedCloud]) -> Vec<Output> {
-        let zero = *self.zero.get_or_insert_with(|| {
-            self.early.iter().map(Input::stamp).chain([stamp]).min().unwrap_or(stamp)
-        });
+        let zero =
+            *self.zero.get_or_insert_with(|| self.early.iter().map(Input::stamp).chain([stamp]).min().unwrap_or(stamp));
         let cutter = self.cutter.get_or_insert_with(|| WindowCutter::new(self.settings.windows, zero));
         for input in self.early.drain(..) {
             if let Input::Wrench(wrench) = input {
@@ -241,7 +241,10 @@ impl Pipeline {
         for (label, scan) in &frame.scans {
             let last = self.current.get(label).copied().unwrap_or_else(Pose::identity);
             let mut measurement = PoseMeasurement { displacement: last, information: Matrix6::zeros() };
-            if *label != learner.root && scan.len() >= FEWEST_POINTS && let Some(model) = learner.models.get(label) {
+            if *label != learner.root
+                && scan.len() >= FEWEST_POINTS
+                && let Some(model) = learner.models.get(label)
+            {
                 let r = model.radius;
                 let prior = Matrix6::from_diagonal(&(Vector6::new(r * r, r * r, r * r, 1.0, 1.0, 1.0) * 2.5e3));
                 let aligned = align(model, scan, &last, &prior, &settings, 6);
@@ -264,7 +267,8 @@ impl Pipeline {
     fn something_moves(&self, frame: &Frame) -> bool {
         let (Some(learner), Some(before)) = (&self.learner, self.recent.first()) else { return false };
         frame.scans.iter().any(|(label, scan)| {
-            let (Some(model), Some(old), Some(new)) = (learner.models.get(label), before.get(label), self.current.get(label))
+            let (Some(model), Some(old), Some(new)) =
+                (learner.models.get(label), before.get(label), self.current.get(label))
             else {
                 return false;
             };

@@ -77,10 +77,11 @@ pub fn frame_of(time_s: f64, clouds: &[SegmentedCloud]) -> Frame {
     let mut frame = Frame { time_s, ..Frame::default() };
     for cloud in clouds {
         for point in &cloud.points {
-            frame.scans.entry(point.label).or_default().push(ScanPoint {
-                point_in_world: point.point_in_world,
-                viewpoint_in_world: cloud.viewpoint_in_world,
-            });
+            frame
+                .scans
+                .entry(point.label)
+                .or_default()
+                .push(ScanPoint { point_in_world: point.point_in_world, viewpoint_in_world: cloud.viewpoint_in_world });
         }
     }
     frame
@@ -162,7 +163,12 @@ impl WindowCutter {
     }
 
     /// Adds a frame; returns a window that closes with it. `moving`: whether a part still moves.
-    pub fn push_frame(&mut self, frame: Frame, moving: bool, nearest: impl Fn(&Vector3<f64>, &Frame) -> Option<Label>) -> Option<WindowJob> {
+    pub fn push_frame(
+        &mut self,
+        frame: Frame,
+        moving: bool,
+        nearest: impl Fn(&Vector3<f64>, &Frame) -> Option<Label>,
+    ) -> Option<WindowJob> {
         let now = frame.time_s;
         let previous = self.frames.back().map_or(now - 0.1, |f| f.time_s);
         if self.rest_force.is_none() {
@@ -235,7 +241,9 @@ impl WindowCutter {
         for k in first..=last {
             if let Some((position, sigma)) = self.tool_at(frames[k].time_s) {
                 track.push((k, position, sigma));
-                if active[k] && let Some(label) = nearest(&position, &frames[k]) {
+                if active[k]
+                    && let Some(label) = nearest(&position, &frames[k])
+                {
                     *votes.entry(label).or_default() += 1;
                 }
             }

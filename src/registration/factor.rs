@@ -82,7 +82,12 @@ impl Quadratic {
 }
 
 /// The factor of a scan at a pose.
-pub fn pose_factor(model: &PartModel, scan: &[ScanPoint], displacement: &Pose, settings: &AlignmentSettings) -> PoseFactor {
+pub fn pose_factor(
+    model: &PartModel,
+    scan: &[ScanPoint],
+    displacement: &Pose,
+    settings: &AlignmentSettings,
+) -> PoseFactor {
     let mut factor = PoseFactor {
         faces: [Quadratic { hessian: Matrix6::zeros(), gradient: Vector6::zeros() }; 2],
         cost: 0.0,
@@ -105,14 +110,27 @@ pub fn pose_factor(model: &PartModel, scan: &[ScanPoint], displacement: &Pose, s
         }
         factor.matched += 1;
         let arm = y - model.centroid;
-        factor.cost += add_residual(&mut factor.faces[usize::from(surfel.grown)], e, surfel.sigma, &surfel.normal, &arm, settings.student_freedom);
+        factor.cost += add_residual(
+            &mut factor.faces[usize::from(surfel.grown)],
+            e,
+            surfel.sigma,
+            &surfel.normal,
+            &arm,
+            settings.student_freedom,
+        );
         let along = offset - surfel.normal * e;
         let distance = along.norm();
         if distance > BOUNDARY_SLACK && settings.boundary_sigma.is_finite() {
             let direction = along / distance;
             let face = &mut factor.faces[usize::from(surfel.grown)];
-            factor.cost +=
-                add_residual(face, distance - BOUNDARY_SLACK, settings.boundary_sigma, &direction, &arm, settings.student_freedom);
+            factor.cost += add_residual(
+                face,
+                distance - BOUNDARY_SLACK,
+                settings.boundary_sigma,
+                &direction,
+                &arm,
+                settings.student_freedom,
+            );
         }
     }
     factor
@@ -138,7 +156,12 @@ pub fn truncated_cost(model: &PartModel, scan: &[ScanPoint], stride: usize, disp
 }
 
 /// The nearest surfel that faces the sensor, if any is in reach.
-fn matching_surfel(model: &PartModel, scan_point: &ScanPoint, y: &Vector3<f64>, reference_from_world: &Pose) -> Option<usize> {
+fn matching_surfel(
+    model: &PartModel,
+    scan_point: &ScanPoint,
+    y: &Vector3<f64>,
+    reference_from_world: &Pose,
+) -> Option<usize> {
     let [first, second] = model.field.nearest(y);
     let first = first? as usize;
     let Some(viewpoint) = scan_point.viewpoint_in_world else { return Some(first) };
@@ -151,7 +174,14 @@ fn matching_surfel(model: &PartModel, scan_point: &ScanPoint, y: &Vector3<f64>, 
 }
 
 /// Adds a residual along a direction at an arm from the centroid; returns its cost.
-fn add_residual(face: &mut Quadratic, e: f64, sigma: f64, direction: &Vector3<f64>, arm: &Vector3<f64>, freedom: f64) -> f64 {
+fn add_residual(
+    face: &mut Quadratic,
+    e: f64,
+    sigma: f64,
+    direction: &Vector3<f64>,
+    arm: &Vector3<f64>,
+    freedom: f64,
+) -> f64 {
     let normalized = e / sigma;
     let weight = (freedom + 1.0) / (freedom + normalized * normalized) / (sigma * sigma);
     let moment = arm.cross(direction);

@@ -36,12 +36,8 @@ impl NearestField {
         let extent = high - low + Vector3::repeat(2.0 * REACH);
         let cell = CELL.max((extent.product() / MOST_CELLS).cbrt());
         let shape = [0, 1, 2].map(|axis| (extent[axis] / cell).ceil() as usize + 1);
-        let mut field = Self {
-            origin: low - Vector3::repeat(REACH),
-            cell,
-            shape,
-            cells: vec![[NONE; 2]; shape.iter().product()],
-        };
+        let mut field =
+            Self { origin: low - Vector3::repeat(REACH), cell, shape, cells: vec![[NONE; 2]; shape.iter().product()] };
         field.fill(surfels);
         field
     }

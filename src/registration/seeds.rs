@@ -125,13 +125,16 @@ fn principal_frame(model: &PartModel) -> [Vector3<f64>; 3] {
 }
 
 /// Mean, eigenvectors and eigenvalues (ascending) of a track's covariance.
-fn scatter(track: &[Vector3<f64>]) -> Option<(Vector3<f64>, [Vector3<f64>; 3], [f64; 3])> {
+type Scatter = (Vector3<f64>, [Vector3<f64>; 3], [f64; 3]);
+
+fn scatter(track: &[Vector3<f64>]) -> Option<Scatter> {
     if track.len() < 3 {
         return None;
     }
     let count = track.len() as f64;
     let mean = track.iter().sum::<Vector3<f64>>() / count;
-    let eigen = (track.iter().map(|p| (p - mean) * (p - mean).transpose()).sum::<Matrix3<f64>>() / count).symmetric_eigen();
+    let eigen =
+        (track.iter().map(|p| (p - mean) * (p - mean).transpose()).sum::<Matrix3<f64>>() / count).symmetric_eigen();
     let mut order = [0, 1, 2];
     order.sort_by(|&a, &b| eigen.eigenvalues[a].total_cmp(&eigen.eigenvalues[b]));
     Some((mean, order.map(|i| eigen.eigenvectors.column(i).into()), order.map(|i| eigen.eigenvalues[i].max(0.0))))

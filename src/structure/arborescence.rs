@@ -37,11 +37,7 @@ fn best_parents(weights: &DMatrix<f64>) -> Vec<usize> {
     let mut entry = vec![cycle[0]; contracted];
     let mut exit = vec![cycle[0]; contracted];
     for (row, &parent) in outside.iter().enumerate() {
-        for (column, &child) in outside
-            .iter()
-            .enumerate()
-            .filter(|&(column, _)| column != row)
-        {
+        for (column, &child) in outside.iter().enumerate().filter(|&(column, _)| column != row) {
             smaller[(row, column)] = weights[(parent, child)];
         }
         for &node in &cycle {
@@ -60,11 +56,7 @@ fn best_parents(weights: &DMatrix<f64>) -> Vec<usize> {
     let smaller_parents = best_parents(&smaller);
     for (column, &child) in outside.iter().enumerate().skip(1) {
         let parent = smaller_parents[column];
-        parents[child] = if parent == contracted {
-            exit[column]
-        } else {
-            outside[parent]
-        };
+        parents[child] = if parent == contracted { exit[column] } else { outside[parent] };
     }
     let row = smaller_parents[contracted];
     parents[entry[row]] = outside[row];

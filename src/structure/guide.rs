@@ -4,8 +4,7 @@ use nalgebra::DMatrix;
 use rand::Rng;
 
 use super::natural_gradient::{
-    exact_elbo, natural_gradient_by_enumeration, natural_gradient_by_samples,
-    natural_gradient_of_edge_scores,
+    exact_elbo, natural_gradient_by_enumeration, natural_gradient_by_samples, natural_gradient_of_edge_scores,
 };
 use super::{StructureError, Tree, TreeDistribution};
 
@@ -68,11 +67,7 @@ pub trait TreeGuide {
     /// # Errors
     /// The target is not finite at a tree that the guide can draw, or leaves no tree possible. The
     /// guide stays as it was.
-    fn step(
-        &mut self,
-        target: &dyn TreeTarget,
-        rng: &mut dyn Rng,
-    ) -> Result<FitStep, StructureError>;
+    fn step(&mut self, target: &dyn TreeTarget, rng: &mut dyn Rng) -> Result<FitStep, StructureError>;
 }
 
 /// The edge-factored family, fitted by natural gradients.
@@ -104,19 +99,10 @@ impl MatrixTreeGuide {
     pub fn from_distribution(distribution: TreeDistribution) -> Self {
         // A regression needs more draws than its N (N − 1) unknowns.
         let draws_per_step = (16 * distribution.part_count().pow(2)).max(16);
-        Self {
-            distribution,
-            rate: 1.0,
-            enumerate_up_to: 6,
-            draws_per_step,
-        }
+        Self { distribution, rate: 1.0, enumerate_up_to: 6, draws_per_step }
     }
 
-    fn moved(
-        &self,
-        gradient: &DMatrix<f64>,
-        rate: f64,
-    ) -> Result<TreeDistribution, StructureError> {
+    fn moved(&self, gradient: &DMatrix<f64>, rate: f64) -> Result<TreeDistribution, StructureError> {
         TreeDistribution::new(&(self.distribution.log_weights() + gradient * rate))
     }
 
@@ -153,27 +139,17 @@ impl TreeGuide for MatrixTreeGuide {
         self.distribution.edge_marginals().clone()
     }
 
-    fn step(
-        &mut self,
-        target: &dyn TreeTarget,
-        rng: &mut dyn Rng,
-    ) -> Result<FitStep, StructureError> {
+    fn step(&mut self, target: &dyn TreeTarget, rng: &mut dyn Rng) -> Result<FitStep, StructureError> {
         let (gradient, elbo) = if let Some(scores) = target.edge_scores() {
             let elbo = self.distribution.expectation(scores) + self.distribution.entropy();
-            (
-                natural_gradient_of_edge_scores(&self.distribution, scores),
-                elbo,
-            )
+            (natural_gradient_of_edge_scores(&self.distribution, scores), elbo)
         } else if self.part_count() <= self.enumerate_up_to {
             return self.step_by_enumeration(target);
         } else {
             natural_gradient_by_samples(&self.distribution, target, self.draws_per_step, rng)?
         };
         self.distribution = self.moved(&gradient, self.rate)?;
-        Ok(FitStep {
-            elbo,
-            rate: self.rate,
-        })
+        Ok(FitStep { elbo, rate: self.rate })
     }
 }
 
@@ -192,9 +168,7 @@ mod tests {
         let mut guide = MatrixTreeGuide::uniform(4);
         let target = EdgeScores(scores);
         guide.step(&target, &mut rng)?;
-        let error = (guide.edge_marginals(&mut rng) - goal.edge_marginals())
-            .abs()
-            .max();
+        let error = (guide.edge_marginals(&mut rng) - goal.edge_marginals()).abs().max();
         assert!(error < 1e-14, "{error:e}");
         let second = guide.step(&target, &mut rng)?;
         assert!((second.elbo - goal.log_normalizer()).abs() < 1e-12);
@@ -210,10 +184,7 @@ mod tests {
             let deepest = (1..=4).map(|node| tree.depth(node)).max().unwrap_or(0);
             scores.log_density(tree) + 2.0 * deepest as f64
         };
-        let log_evidence = Tree::all(4)
-            .map(|tree| target(&tree).exp())
-            .sum::<f64>()
-            .ln();
+        let log_evidence = Tree::all(4).map(|tree| target(&tree).exp()).sum::<f64>().ln();
         let mut guide = MatrixTreeGuide::uniform(4);
         let mut last = f64::NEG_INFINITY;
         for _ in 0..60 {
@@ -224,18 +195,11 @@ mod tests {
         // No sum over edges is this target, so a gap stays; the end is a stationary point.
         assert!(last <= log_evidence, "{last} {log_evidence}");
         let left = natural_gradient_by_enumeration(&guide.distribution, &target)?;
-        let pull = left
-            .component_mul(guide.distribution.edge_marginals())
-            .abs()
-            .max();
+        let pull = left.component_mul(guide.distribution.edge_marginals()).abs().max();
         assert!(pull < 1e-6, "{pull:e}");
 
         // From draws: ends near the same optimum.
-        let mut sampled = MatrixTreeGuide {
-            enumerate_up_to: 0,
-            rate: 0.3,
-            ..MatrixTreeGuide::uniform(4)
-        };
+        let mut sampled = MatrixTreeGuide { enumerate_up_to: 0, rate: 0.3, ..MatrixTreeGuide::uniform(4) };
         for _ in 0..60 {
             sampled.step(&target, &mut rng)?;
         }

@@ -81,9 +81,7 @@ impl GumbelParameters {
     pub fn draw(&self, rng: &mut dyn Rng) -> GumbelDraw {
         let size = self.part_count() + 1;
         let order_scores = self.order_logits.map(|logit| logit + standard_gumbel(rng));
-        let edge_scores = self
-            .edge_logits
-            .map(|logit| (logit + standard_gumbel(rng)) / self.edge_temperature);
+        let edge_scores = self.edge_logits.map(|logit| (logit + standard_gumbel(rng)) / self.edge_temperature);
 
         let mut order: Vec<usize> = (1..size).collect();
         order.sort_by(|&a, &b| order_scores[b - 1].total_cmp(&order_scores[a - 1]));
@@ -94,24 +92,14 @@ impl GumbelParameters {
         for position in 1..size {
             let child = order[position];
             let candidates = &order[..position];
-            let column = softmax(
-                candidates
-                    .iter()
-                    .map(|&parent| edge_scores[(parent, child)]),
-            );
+            let column = softmax(candidates.iter().map(|&parent| edge_scores[(parent, child)]));
             parents[child - 1] = candidates[opportunistic_rounding(&column, self.threshold)];
             for (&parent, value) in candidates.iter().zip(column) {
                 relaxed[(parent, child)] = value;
             }
         }
         let tree = Tree::from_valid_parents(parents);
-        GumbelDraw {
-            tree,
-            order,
-            relaxed,
-            order_scores,
-            edge_scores,
-        }
+        GumbelDraw { tree, order, relaxed, order_scores, edge_scores }
     }
 
     /// Straight-through: carries ∂f/∂A at the rounded tree back to the parameters, as though the
@@ -119,11 +107,7 @@ impl GumbelParameters {
     ///
     /// `by_adjacency` is (N+1) × (N+1); a constant added to a column changes nothing, as each
     /// column of A sums to one.
-    pub fn straight_through(
-        &self,
-        draw: &GumbelDraw,
-        by_adjacency: &DMatrix<f64>,
-    ) -> GumbelGradient {
+    pub fn straight_through(&self, draw: &GumbelDraw, by_adjacency: &DMatrix<f64>) -> GumbelGradient {
         let size = self.part_count() + 1;
         let mut edge_logits = DMatrix::zeros(size, size);
         for child in 1..size {
@@ -136,10 +120,7 @@ impl GumbelParameters {
         }
         let by_mask = draw.gain_of_admission(by_adjacency);
         let order_logits = self.order_gradient(draw, &by_mask);
-        GumbelGradient {
-            order_logits,
-            edge_logits,
-        }
+        GumbelGradient { order_logits, edge_logits }
     }
 
     /// Through mask_ij = σ((s_i − s_j) / τ_P).
@@ -173,20 +154,13 @@ impl GumbelDraw {
         for (position, &child) in self.order.iter().enumerate().skip(1) {
             for parent in (1..size).filter(|&parent| parent != child) {
                 // The root is always among them.
-                let others = self.order[..position]
-                    .iter()
-                    .copied()
-                    .filter(|&other| other != parent);
+                let others = self.order[..position].iter().copied().filter(|&other| other != parent);
                 let candidates = || others.clone().chain([parent]);
                 let shares = softmax(candidates().map(|node| self.edge_scores[(node, child)]));
                 let gain = by_adjacency[(parent, child)];
-                let over_others =
-                    softmax(others.clone().map(|node| self.edge_scores[(node, child)]));
-                let mean: f64 = others
-                    .clone()
-                    .zip(over_others)
-                    .map(|(node, share)| share * by_adjacency[(node, child)])
-                    .sum();
+                let over_others = softmax(others.clone().map(|node| self.edge_scores[(node, child)]));
+                let mean: f64 =
+                    others.clone().zip(over_others).map(|(node, share)| share * by_adjacency[(node, child)]).sum();
                 gains[(parent, child)] = shares[shares.len() - 1] * (gain - mean);
             }
         }
@@ -304,15 +278,9 @@ mod tests {
         let mut mean = DVector::zeros(3);
         for _ in 0..2000 {
             let draw = parameters.draw(&mut rng);
-            mean += parameters
-                .straight_through(&draw, &by_adjacency)
-                .order_logits
-                / 2000.0;
+            mean += parameters.straight_through(&draw, &by_adjacency).order_logits / 2000.0;
         }
-        assert!(
-            mean[1] > 0.02 && mean[0] < -0.02 && mean[2].abs() < 0.02,
-            "{mean}"
-        );
+        assert!(mean[1] > 0.02 && mean[0] < -0.02 && mean[2].abs() < 0.02, "{mean}");
         assert!(mean.sum().abs() < 1e-12);
     }
 }

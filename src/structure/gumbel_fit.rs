@@ -15,10 +15,7 @@ use nalgebra::{DMatrix, DVector};
 use rand::Rng;
 
 use super::gumbel::softmax;
-use super::{
-    FitStep, GumbelDraw, GumbelGradient, GumbelParameters, StructureError, Tree, TreeGuide,
-    TreeTarget,
-};
+use super::{FitStep, GumbelDraw, GumbelGradient, GumbelParameters, StructureError, Tree, TreeGuide, TreeTarget};
 
 /// A worse re-parenting than this [nats] is as good as impossible: exp(−50) = 2e-22.
 const WORST_GAIN: f64 = -50.0;
@@ -36,11 +33,7 @@ pub struct GumbelFitSettings {
 
 impl Default for GumbelFitSettings {
     fn default() -> Self {
-        Self {
-            draws_per_step: 16,
-            learning_rate: 0.03,
-            draws_for_marginals: 10_000,
-        }
+        Self { draws_per_step: 16, learning_rate: 0.03, draws_for_marginals: 10_000 }
     }
 }
 
@@ -59,11 +52,7 @@ impl GumbelGuide {
     /// Starts with all logits zero.
     pub fn new(part_count: usize, settings: GumbelFitSettings) -> Self {
         let size = part_count + 1;
-        Self {
-            parameters: GumbelParameters::new(part_count),
-            settings,
-            optimizer: Adam::new(part_count + size * size),
-        }
+        Self { parameters: GumbelParameters::new(part_count), settings, optimizer: Adam::new(part_count + size * size) }
     }
 
     /// The bound's value at one draw, and its gradient without the order's score function.
@@ -76,10 +65,7 @@ impl GumbelGuide {
         let here = reward(&draw.tree);
         if !here.is_finite() {
             let parents = draw.tree.parents().to_vec();
-            return Err(StructureError::LogDensity {
-                parents,
-                log_density: here,
-            });
+            return Err(StructureError::LogDensity { parents, log_density: here });
         }
         let gains = reparenting_gains(draw, |tree| (reward(tree) - here).max(WORST_GAIN));
         let mut gradient = self.parameters.straight_through(draw, &gains);
@@ -87,9 +73,7 @@ impl GumbelGuide {
         let mut edge_entropy = 0.0;
         for (position, &child) in draw.order.iter().enumerate().skip(1) {
             let candidates = &draw.order[..position];
-            let logits = candidates
-                .iter()
-                .map(|&parent| self.parameters.edge_logits[(parent, child)]);
+            let logits = candidates.iter().map(|&parent| self.parameters.edge_logits[(parent, child)]);
             let shares = softmax(logits);
             let entropy: f64 = shares.iter().copied().map(negative_x_ln_x).sum();
             for (&parent, &share) in candidates.iter().zip(&shares) {
@@ -99,14 +83,7 @@ impl GumbelGuide {
         }
         let (log_order, order_score) = plackett_luce(&self.parameters.order_logits, &draw.order);
         let entropies = edge_entropy - log_order;
-        Ok((
-            Evaluation {
-                bound: here + entropies,
-                entropies,
-                order_score,
-            },
-            gradient,
-        ))
+        Ok((Evaluation { bound: here + entropies, entropies, order_score }, gradient))
     }
 }
 
@@ -144,11 +121,7 @@ impl TreeGuide for GumbelGuide {
         marginals
     }
 
-    fn step(
-        &mut self,
-        target: &dyn TreeTarget,
-        rng: &mut dyn Rng,
-    ) -> Result<FitStep, StructureError> {
+    fn step(&mut self, target: &dyn TreeTarget, rng: &mut dyn Rng) -> Result<FitStep, StructureError> {
         let draws = self.settings.draws_per_step.max(2);
         let weight = 1.0 / draws as f64;
         let size = self.part_count() + 1;
@@ -162,10 +135,7 @@ impl TreeGuide for GumbelGuide {
             edge_gradient += gradient.edge_logits * weight;
             evaluations.push(evaluation);
         }
-        let total: f64 = evaluations
-            .iter()
-            .map(|evaluation| evaluation.entropies)
-            .sum();
+        let total: f64 = evaluations.iter().map(|evaluation| evaluation.entropies).sum();
         for evaluation in &evaluations {
             // The mean of the other draws as the baseline keeps the estimate unbiased.
             let baseline = (total - evaluation.entropies) / (draws - 1) as f64;
@@ -173,27 +143,14 @@ impl TreeGuide for GumbelGuide {
             order_gradient += &evaluation.order_score * (weight * advantage);
         }
 
-        let gradient: Vec<f64> = order_gradient
-            .iter()
-            .chain(edge_gradient.iter())
-            .copied()
-            .collect();
+        let gradient: Vec<f64> = order_gradient.iter().chain(edge_gradient.iter()).copied().collect();
         let steps = self.optimizer.step(&gradient, self.settings.learning_rate);
         let logits = self.parameters.order_logits.iter_mut();
-        for (logit, step) in logits
-            .chain(self.parameters.edge_logits.iter_mut())
-            .zip(steps)
-        {
+        for (logit, step) in logits.chain(self.parameters.edge_logits.iter_mut()).zip(steps) {
             *logit += step;
         }
-        let elbo = evaluations
-            .iter()
-            .map(|evaluation| evaluation.bound * weight)
-            .sum();
-        Ok(FitStep {
-            elbo,
-            rate: self.settings.learning_rate,
-        })
+        let elbo = evaluations.iter().map(|evaluation| evaluation.bound * weight).sum();
+        Ok(FitStep { elbo, rate: self.settings.learning_rate })
     }
 }
 
@@ -223,13 +180,8 @@ fn reparenting_gains(draw: &GumbelDraw, gain: impl Fn(&Tree) -> f64) -> DMatrix<
 
 /// ln r(o | G) for any order that agrees with the tree.
 fn log_order_posterior(tree: &Tree) -> f64 {
-    let log_sizes: f64 = tree.subtree_sizes()[1..]
-        .iter()
-        .map(|&size| (size as f64).ln())
-        .sum();
-    let log_factorial: f64 = (1..=tree.part_count())
-        .map(|count| (count as f64).ln())
-        .sum();
+    let log_sizes: f64 = tree.subtree_sizes()[1..].iter().map(|&size| (size as f64).ln()).sum();
+    let log_factorial: f64 = (1..=tree.part_count()).map(|count| (count as f64).ln()).sum();
     log_sizes - log_factorial
 }
 
@@ -267,11 +219,7 @@ impl Adam {
     const EPSILON: f64 = 1e-8;
 
     fn new(dimension: usize) -> Self {
-        Self {
-            first: vec![0.0; dimension],
-            second: vec![0.0; dimension],
-            steps: 0,
-        }
+        Self { first: vec![0.0; dimension], second: vec![0.0; dimension], steps: 0 }
     }
 
     /// What to add to the parameters to ascend.
@@ -301,15 +249,8 @@ mod tests {
     use std::collections::BTreeMap;
 
     /// KL(q ‖ p) from a histogram of draws; biased up by trees / (2 draws).
-    fn divergence(
-        guide: &GumbelGuide,
-        target: &EdgeScores,
-        draws: u32,
-        rng: &mut ChaCha8Rng,
-    ) -> f64 {
-        let evidence: f64 = Tree::all(guide.part_count())
-            .map(|tree| target.log_density(&tree).exp())
-            .sum();
+    fn divergence(guide: &GumbelGuide, target: &EdgeScores, draws: u32, rng: &mut ChaCha8Rng) -> f64 {
+        let evidence: f64 = Tree::all(guide.part_count()).map(|tree| target.log_density(&tree).exp()).sum();
         let mut counts = BTreeMap::new();
         for _ in 0..draws {
             *counts.entry(guide.sample(rng)).or_insert(0_u32) += 1;
@@ -329,11 +270,9 @@ mod tests {
             let agreeing = permutations(4)
                 .into_iter()
                 .filter(|order| {
-                    let before = |a: usize, b: usize| {
-                        order.iter().position(|&x| x == a) < order.iter().position(|&x| x == b)
-                    };
-                    tree.edges()
-                        .all(|(parent, child)| parent == 0 || before(parent, child))
+                    let before =
+                        |a: usize, b: usize| order.iter().position(|&x| x == a) < order.iter().position(|&x| x == b);
+                    tree.edges().all(|(parent, child)| parent == 0 || before(parent, child))
                 })
                 .count();
             assert!((log_order_posterior(&tree) + (agreeing as f64).ln()).abs() < 1e-12);
@@ -410,15 +349,9 @@ mod tests {
                 bounds.push(guide.step(&target, &mut rng)?.elbo);
             }
             let after = divergence(&guide, &target, 40_000, &mut rng);
-            assert!(
-                after < 0.4 * before,
-                "{part_count} parts: {before} -> {after}"
-            );
+            assert!(after < 0.4 * before, "{part_count} parts: {before} -> {after}");
             let mean = |bounds: &[f64]| bounds.iter().sum::<f64>() / bounds.len() as f64;
-            assert!(
-                mean(&bounds[350..]) > mean(&bounds[..50]),
-                "{part_count} parts"
-            );
+            assert!(mean(&bounds[350..]) > mean(&bounds[..50]), "{part_count} parts");
         }
         Ok(())
     }

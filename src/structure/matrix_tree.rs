@@ -53,13 +53,7 @@ impl TreeDistribution {
             // Every child gives the same Z.
             log_normalizer = (column.forests * column.total).ln();
         }
-        Ok(Self {
-            log_weights,
-            log_scale,
-            log_normalizer,
-            log_marginals,
-            marginals,
-        })
+        Ok(Self { log_weights, log_scale, log_normalizer, log_marginals, marginals })
     }
 
     /// The uniform distribution over all trees, the prior (paper, 3.2).
@@ -112,10 +106,7 @@ impl TreeDistribution {
     /// E_q[Σ_edges score], edges of probability zero left out.
     pub fn expectation(&self, scores: &DMatrix<f64>) -> f64 {
         let terms = self.marginals.iter().zip(scores.iter());
-        terms
-            .filter(|(marginal, _)| **marginal > 0.0)
-            .map(|(marginal, score)| marginal * score)
-            .sum()
+        terms.filter(|(marginal, _)| **marginal > 0.0).map(|(marginal, score)| marginal * score).sum()
     }
 
     /// A most likely tree (Chu–Liu/Edmonds).
@@ -165,21 +156,13 @@ impl ParentWeights {
         reaches_root[0] = Wide::ONE;
         for (step, &node) in eliminated.iter().enumerate().rev() {
             let later = eliminated[step + 1..].iter().copied();
-            let towards_root: Wide = std::iter::once(0)
-                .chain(later)
-                .map(|parent| reduced[(parent, node)] * reaches_root[parent])
-                .sum();
+            let towards_root: Wide =
+                std::iter::once(0).chain(later).map(|parent| reduced[(parent, node)] * reaches_root[parent]).sum();
             reaches_root[node] = towards_root / step_totals[step];
         }
-        let by_parent: Vec<Wide> = (0..size)
-            .map(|parent| weights[(parent, child)] * reaches_root[parent])
-            .collect();
+        let by_parent: Vec<Wide> = (0..size).map(|parent| weights[(parent, child)] * reaches_root[parent]).collect();
         let total: Wide = by_parent.iter().copied().sum();
-        (!total.is_zero()).then_some(Self {
-            by_parent,
-            total,
-            forests,
-        })
+        (!total.is_zero()).then_some(Self { by_parent, total, forests })
     }
 }
 
@@ -187,11 +170,7 @@ impl ParentWeights {
 fn scale_columns(log_weights: &DMatrix<f64>) -> Result<(DMatrix<f64>, f64), StructureError> {
     let (rows, columns) = log_weights.shape();
     if rows != columns || rows == 0 {
-        return Err(StructureError::Shape {
-            rows,
-            columns,
-            expected: columns.max(1),
-        });
+        return Err(StructureError::Shape { rows, columns, expected: columns.max(1) });
     }
     let mut scaled = DMatrix::from_element(rows, rows, f64::NEG_INFINITY);
     let mut log_scale = 0.0;
@@ -200,11 +179,7 @@ fn scale_columns(log_weights: &DMatrix<f64>) -> Result<(DMatrix<f64>, f64), Stru
         for parent in (0..rows).filter(|&parent| parent != child) {
             let log_weight = log_weights[(parent, child)];
             if log_weight.is_nan() || log_weight == f64::INFINITY {
-                return Err(StructureError::LogWeight {
-                    parent,
-                    child,
-                    log_weight,
-                });
+                return Err(StructureError::LogWeight { parent, child, log_weight });
             }
             largest = largest.max(log_weight);
         }

@@ -10,9 +10,7 @@ fn by_enumeration(log_weights: &DMatrix<f64>) -> (Wide, DMatrix<Wide>) {
     let mut normalizer = Wide::ZERO;
     let mut sums = DMatrix::from_element(size, size, Wide::ZERO);
     for tree in Tree::all(size - 1) {
-        let weight = tree
-            .edges()
-            .fold(Wide::ONE, |product, edge| product * weights[edge]);
+        let weight = tree.edges().fold(Wide::ONE, |product, edge| product * weights[edge]);
         normalizer = normalizer + weight;
         for edge in tree.edges() {
             sums[edge] = sums[edge] + weight;
@@ -25,17 +23,13 @@ fn by_enumeration(log_weights: &DMatrix<f64>) -> (Wide, DMatrix<Wide>) {
 fn log_weights() -> impl Strategy<Value = DMatrix<f64>> {
     let spread = prop_oneof![Just(1.0), Just(30.0), Just(345.0)];
     let entry = prop_oneof![6 => -1.0..1.0_f64, 1 => Just(f64::NEG_INFINITY)];
-    (1..=6_usize, spread, prop::collection::vec(entry, 36)).prop_map(|(size, spread, entries)| {
-        DMatrix::from_fn(size, size, |i, j| spread * entries[6 * i + j])
-    })
+    (1..=6_usize, spread, prop::collection::vec(entry, 36))
+        .prop_map(|(size, spread, entries)| DMatrix::from_fn(size, size, |i, j| spread * entries[6 * i + j]))
 }
 
 fn assert_relative(actual: f64, expected: f64, tolerance: f64) {
     let error = (actual - expected).abs();
-    assert!(
-        error <= tolerance * expected.abs(),
-        "{actual:e}, expected {expected:e}"
-    );
+    assert!(error <= tolerance * expected.abs(), "{actual:e}, expected {expected:e}");
 }
 
 proptest! {
@@ -115,11 +109,7 @@ fn uniform_counts_the_trees() {
         let count = ((part_count + 1) as f64).powi(part_count as i32 - 1);
         assert_relative(uniform.log_normalizer().exp(), count, 1e-14);
         assert_relative(uniform.entropy().exp(), count, 1e-13);
-        assert_relative(
-            uniform.edge_marginals()[(0, 1)],
-            2.0 / (part_count + 1) as f64,
-            1e-15,
-        );
+        assert_relative(uniform.edge_marginals()[(0, 1)], 2.0 / (part_count + 1) as f64, 1e-15);
     }
 }
 
@@ -151,10 +141,7 @@ fn a_marginal_of_1e_minus_200_keeps_its_digits() -> Result<(), StructureError> {
 #[test]
 fn an_empty_world_has_one_tree() -> Result<(), StructureError> {
     let distribution = TreeDistribution::new(&DMatrix::zeros(1, 1))?;
-    assert_eq!(
-        (distribution.log_normalizer(), distribution.entropy()),
-        (0.0, 0.0)
-    );
+    assert_eq!((distribution.log_normalizer(), distribution.entropy()), (0.0, 0.0));
     assert_eq!(distribution.most_likely(), Tree::star(0));
     assert_eq!(distribution.log_prob(&Tree::star(0)), 0.0);
     Ok(())
@@ -167,26 +154,9 @@ fn weights_without_a_tree_are_refused() {
     log_weights[(0, 2)] = f64::NEG_INFINITY;
     log_weights[(3, 1)] = f64::NEG_INFINITY;
     log_weights[(3, 2)] = f64::NEG_INFINITY;
-    assert_eq!(
-        TreeDistribution::new(&log_weights).err(),
-        Some(StructureError::NoTree)
-    );
+    assert_eq!(TreeDistribution::new(&log_weights).err(), Some(StructureError::NoTree));
     log_weights[(3, 2)] = f64::NAN;
-    assert!(matches!(
-        TreeDistribution::new(&log_weights),
-        Err(StructureError::LogWeight {
-            parent: 3,
-            child: 2,
-            ..
-        })
-    ));
-    let expected = StructureError::Shape {
-        rows: 2,
-        columns: 3,
-        expected: 3,
-    };
-    assert_eq!(
-        TreeDistribution::new(&DMatrix::zeros(2, 3)).err(),
-        Some(expected)
-    );
+    assert!(matches!(TreeDistribution::new(&log_weights), Err(StructureError::LogWeight { parent: 3, child: 2, .. })));
+    let expected = StructureError::Shape { rows: 2, columns: 3, expected: 3 };
+    assert_eq!(TreeDistribution::new(&DMatrix::zeros(2, 3)).err(), Some(expected));
 }

@@ -23,8 +23,7 @@ pub use gumbel::{GumbelDraw, GumbelGradient, GumbelParameters, opportunistic_rou
 pub use gumbel_fit::{GumbelFitSettings, GumbelGuide};
 pub use matrix_tree::TreeDistribution;
 pub use natural_gradient::{
-    exact_elbo, natural_gradient_by_enumeration, natural_gradient_by_samples,
-    natural_gradient_of_edge_scores,
+    exact_elbo, natural_gradient_by_enumeration, natural_gradient_by_samples, natural_gradient_of_edge_scores,
 };
 pub use tree::{AllTrees, Tree};
 
@@ -71,9 +70,7 @@ pub enum StructureError {
     #[error("edge weights: some part has no path of positive weight to the root")]
     NoTree,
     /// The target log density is not finite at a tree that the guide can draw.
-    #[error(
-        "log density of tree {parents:?}: {log_density}, need finite where the guide is positive"
-    )]
+    #[error("log density of tree {parents:?}: {log_density}, need finite where the guide is positive")]
     LogDensity {
         /// Parents of nodes 1..=N.
         parents: Vec<usize>,

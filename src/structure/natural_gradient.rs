@@ -26,17 +26,13 @@ struct Case {
 }
 
 /// ln p − ln q per edge, for ln p = Σ_edges `scores`; 0 where q has no such edge.
-pub fn natural_gradient_of_edge_scores(
-    distribution: &TreeDistribution,
-    scores: &DMatrix<f64>,
-) -> DMatrix<f64> {
-    scores.zip_map(distribution.log_weights(), |score, log_weight| {
-        if log_weight.is_finite() {
-            score - log_weight
-        } else {
-            0.0
-        }
-    })
+pub fn natural_gradient_of_edge_scores(distribution: &TreeDistribution, scores: &DMatrix<f64>) -> DMatrix<f64> {
+    scores.zip_map(
+        distribution.log_weights(),
+        |score, log_weight| {
+            if log_weight.is_finite() { score - log_weight } else { 0.0 }
+        },
+    )
 }
 
 /// Exact for any target, from all (N+1)^(N−1) trees.
@@ -52,11 +48,7 @@ pub fn natural_gradient_by_enumeration(
         let weight = distribution.log_prob(&tree).exp();
         if weight > 0.0 {
             let log_ratio = log_ratio(distribution, target, &tree)?;
-            cases.push(Case {
-                tree,
-                weight,
-                log_ratio,
-            });
+            cases.push(Case { tree, weight, log_ratio });
         }
     }
     Ok(regress(distribution, &cases))
@@ -78,11 +70,7 @@ pub fn natural_gradient_by_samples(
     for _ in 0..count {
         let tree = distribution.sample(rng);
         let log_ratio = log_ratio(distribution, target, &tree)?;
-        cases.push(Case {
-            tree,
-            weight,
-            log_ratio,
-        });
+        cases.push(Case { tree, weight, log_ratio });
     }
     let elbo = cases.iter().map(|case| case.weight * case.log_ratio).sum();
     Ok((regress(distribution, &cases), elbo))
@@ -92,10 +80,7 @@ pub fn natural_gradient_by_samples(
 ///
 /// # Errors
 /// The target is not finite at a tree that q can draw.
-pub fn exact_elbo(
-    distribution: &TreeDistribution,
-    target: &dyn TreeTarget,
-) -> Result<f64, StructureError> {
+pub fn exact_elbo(distribution: &TreeDistribution, target: &dyn TreeTarget) -> Result<f64, StructureError> {
     let mut elbo = 0.0;
     for tree in Tree::all(distribution.part_count()) {
         let probability = distribution.log_prob(&tree).exp();
@@ -106,17 +91,10 @@ pub fn exact_elbo(
     Ok(elbo)
 }
 
-fn log_ratio(
-    distribution: &TreeDistribution,
-    target: &dyn TreeTarget,
-    tree: &Tree,
-) -> Result<f64, StructureError> {
+fn log_ratio(distribution: &TreeDistribution, target: &dyn TreeTarget, tree: &Tree) -> Result<f64, StructureError> {
     let log_density = target.log_density(tree);
     if !log_density.is_finite() {
-        return Err(StructureError::LogDensity {
-            parents: tree.parents().to_vec(),
-            log_density,
-        });
+        return Err(StructureError::LogDensity { parents: tree.parents().to_vec(), log_density });
     }
     Ok(log_density - distribution.log_prob(tree))
 }
@@ -182,13 +160,7 @@ fn solve_scaled(mut information: DMatrix<f64>, mut gradient: DVector<f64>) -> DV
     if gradient.is_empty() {
         return gradient;
     }
-    let scale = information.diagonal().map(|variance| {
-        if variance > 0.0 {
-            1.0 / variance.sqrt()
-        } else {
-            0.0
-        }
-    });
+    let scale = information.diagonal().map(|variance| if variance > 0.0 { 1.0 / variance.sqrt() } else { 0.0 });
     gradient.component_mul_assign(&scale);
     for (mut column, &factor) in information.column_iter_mut().zip(scale.iter()) {
         column.component_mul_assign(&scale);
@@ -198,11 +170,7 @@ fn solve_scaled(mut information: DMatrix<f64>, mut gradient: DVector<f64>) -> DV
     let floor = RELATIVE_EIGENVALUE_FLOOR * eigen.eigenvalues.max();
     let mut coordinates = eigen.eigenvectors.tr_mul(&gradient);
     for (coordinate, &eigenvalue) in coordinates.iter_mut().zip(eigen.eigenvalues.iter()) {
-        *coordinate = if eigenvalue > floor {
-            *coordinate / eigenvalue
-        } else {
-            0.0
-        };
+        *coordinate = if eigenvalue > floor { *coordinate / eigenvalue } else { 0.0 };
     }
     (eigen.eigenvectors * coordinates).component_mul(&scale)
 }
@@ -222,10 +190,7 @@ mod tests {
         (a - b).abs().max()
     }
 
-    fn stepped(
-        from: &TreeDistribution,
-        step: &DMatrix<f64>,
-    ) -> Result<TreeDistribution, StructureError> {
+    fn stepped(from: &TreeDistribution, step: &DMatrix<f64>) -> Result<TreeDistribution, StructureError> {
         TreeDistribution::new(&(from.log_weights() + step))
     }
 
@@ -256,11 +221,7 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(12);
         let here = TreeDistribution::new(&random_weights(4, 1.0, &mut rng))?;
         // Not a sum over edges.
-        let target = |tree: &Tree| {
-            (0..=3)
-                .map(|node| (tree.depth(node) as f64).powi(2))
-                .sum::<f64>()
-        };
+        let target = |tree: &Tree| (0..=3).map(|node| (tree.depth(node) as f64).powi(2)).sum::<f64>();
         let natural = natural_gradient_by_enumeration(&here, &target)?;
         for edge in [(0, 1), (2, 1), (3, 2), (0, 3)] {
             let moved = |by: f64| -> Result<f64, StructureError> {
@@ -277,10 +238,7 @@ mod tests {
                 let centred = indicator - here.edge_marginals()[edge];
                 covariance += here.log_prob(&tree).exp() * centred * along;
             }
-            assert!(
-                (covariance - numerical).abs() < 1e-7,
-                "{covariance} {numerical}"
-            );
+            assert!((covariance - numerical).abs() < 1e-7, "{covariance} {numerical}");
         }
         Ok(())
     }
@@ -288,17 +246,10 @@ mod tests {
     #[test]
     fn a_target_without_value_is_reported() -> Result<(), StructureError> {
         let target = |tree: &Tree| {
-            if tree.depth(1) > 1 {
-                f64::NEG_INFINITY
-            } else {
-                0.0
-            }
+            if tree.depth(1) > 1 { f64::NEG_INFINITY } else { 0.0 }
         };
         let result = natural_gradient_by_enumeration(&TreeDistribution::uniform(2), &target);
-        let expected = StructureError::LogDensity {
-            parents: vec![2, 0],
-            log_density: f64::NEG_INFINITY,
-        };
+        let expected = StructureError::LogDensity { parents: vec![2, 0], log_density: f64::NEG_INFINITY };
         assert_eq!(result.err(), Some(expected));
         Ok(())
     }

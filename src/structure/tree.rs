@@ -20,11 +20,7 @@ impl Tree {
         for (index, &parent) in parents.iter().enumerate() {
             if parent > part_count {
                 let child = index + 1;
-                return Err(StructureError::UnknownParent {
-                    child,
-                    parent,
-                    part_count,
-                });
+                return Err(StructureError::UnknownParent { child, parent, part_count });
             }
         }
         let tree = Self { parents };
@@ -38,9 +34,7 @@ impl Tree {
 
     /// Every part on the body.
     pub fn star(part_count: usize) -> Self {
-        Self {
-            parents: vec![0; part_count],
-        }
+        Self { parents: vec![0; part_count] }
     }
 
     /// Parents known to form a tree.
@@ -51,10 +45,7 @@ impl Tree {
 
     /// All (N+1)^(N−1) trees of N parts (Cayley), each once, in a fixed order.
     pub fn all(part_count: usize) -> AllTrees {
-        AllTrees {
-            part_count,
-            next_code: Some(vec![0; part_count.saturating_sub(1)]),
-        }
+        AllTrees { part_count, next_code: Some(vec![0; part_count.saturating_sub(1)]) }
     }
 
     /// N, the number of nodes without the root.
@@ -74,16 +65,12 @@ impl Tree {
 
     /// The N edges as (parent, child), by child.
     pub fn edges(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
-        self.parents
-            .iter()
-            .enumerate()
-            .map(|(index, &parent)| (parent, index + 1))
+        self.parents.iter().enumerate().map(|(index, &parent)| (parent, index + 1))
     }
 
     /// The nodes that hang directly on `node`, ascending.
     pub fn children(&self, node: usize) -> impl Iterator<Item = usize> + '_ {
-        self.edges()
-            .filter_map(move |(parent, child)| (parent == node).then_some(child))
+        self.edges().filter_map(move |(parent, child)| (parent == node).then_some(child))
     }
 
     /// Parent, grandparent, … up to the root 0; empty for the root.
@@ -202,19 +189,9 @@ mod tests {
 
     #[test]
     fn what_is_no_tree_is_refused() {
-        assert_eq!(
-            Tree::new(vec![2, 1]),
-            Err(StructureError::Cycle { child: 1 })
-        );
-        assert_eq!(
-            Tree::new(vec![0, 2]),
-            Err(StructureError::Cycle { child: 2 })
-        );
-        let unknown = StructureError::UnknownParent {
-            child: 1,
-            parent: 3,
-            part_count: 2,
-        };
+        assert_eq!(Tree::new(vec![2, 1]), Err(StructureError::Cycle { child: 1 }));
+        assert_eq!(Tree::new(vec![0, 2]), Err(StructureError::Cycle { child: 2 }));
+        let unknown = StructureError::UnknownParent { child: 1, parent: 3, part_count: 2 };
         assert_eq!(Tree::new(vec![3, 0]), Err(unknown));
     }
 

@@ -23,14 +23,8 @@ pub(super) struct Wide {
 }
 
 impl Wide {
-    pub(super) const ZERO: Self = Self {
-        mantissa: 0.0,
-        exponent: 0,
-    };
-    pub(super) const ONE: Self = Self {
-        mantissa: 1.0,
-        exponent: 0,
-    };
+    pub(super) const ZERO: Self = Self { mantissa: 0.0, exponent: 0 };
+    pub(super) const ONE: Self = Self { mantissa: 1.0, exponent: 0 };
 
     /// exp(`logarithm`); −∞ gives zero.
     pub(super) fn exp(logarithm: f64) -> Self {
@@ -70,10 +64,7 @@ impl Wide {
         let bits = mantissa.to_bits();
         let shift = ((bits >> 52) & 0x7ff) as i64 - 1023;
         let mantissa = f64::from_bits((bits & !(0x7ff << 52)) | (1023 << 52));
-        Self {
-            mantissa,
-            exponent: exponent + shift,
-        }
+        Self { mantissa, exponent: exponent + shift }
     }
 }
 
@@ -92,19 +83,12 @@ impl Add for Wide {
         if other.is_zero() {
             return self;
         }
-        let (large, small) = if self.exponent >= other.exponent {
-            (self, other)
-        } else {
-            (other, self)
-        };
+        let (large, small) = if self.exponent >= other.exponent { (self, other) } else { (other, self) };
         let gap = large.exponent - small.exponent;
         if gap > NEGLIGIBLE_EXPONENT_GAP {
             return large;
         }
-        Self::normalized(
-            large.mantissa + small.mantissa * power_of_two(-gap),
-            large.exponent,
-        )
+        Self::normalized(large.mantissa + small.mantissa * power_of_two(-gap), large.exponent)
     }
 }
 
@@ -112,10 +96,7 @@ impl Mul for Wide {
     type Output = Self;
 
     fn mul(self, other: Self) -> Self {
-        Self::normalized(
-            self.mantissa * other.mantissa,
-            self.exponent + other.exponent,
-        )
+        Self::normalized(self.mantissa * other.mantissa, self.exponent + other.exponent)
     }
 }
 
@@ -125,10 +106,7 @@ impl Div for Wide {
     /// The divisor must not be zero.
     fn div(self, other: Self) -> Self {
         debug_assert!(!other.is_zero(), "division by zero");
-        Self::normalized(
-            self.mantissa / other.mantissa,
-            self.exponent - other.exponent,
-        )
+        Self::normalized(self.mantissa / other.mantissa, self.exponent - other.exponent)
     }
 }
 
@@ -144,10 +122,7 @@ mod tests {
     use proptest::prelude::*;
 
     fn assert_close(actual: f64, expected: f64) {
-        assert!(
-            (actual - expected).abs() <= 4e-16 * expected.abs(),
-            "{actual} {expected}"
-        );
+        assert!((actual - expected).abs() <= 4e-16 * expected.abs(), "{actual} {expected}");
     }
 
     proptest! {

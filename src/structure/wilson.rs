@@ -54,10 +54,7 @@ pub(super) fn parent_by_parent(log_weights: &DMatrix<f64>, rng: &mut dyn Rng) ->
     for child in 1..size {
         let parent = ParentWeights::new(&weights, child)
             .and_then(|column| {
-                let shares = column
-                    .by_parent
-                    .iter()
-                    .map(|&weight| (weight / column.total).to_f64());
+                let shares = column.by_parent.iter().map(|&weight| (weight / column.total).to_f64());
                 draw_index(shares, rng)
             })
             .unwrap_or_else(|| unreachable!("some tree has positive weight"));
@@ -93,11 +90,7 @@ mod tests {
     use std::collections::BTreeMap;
 
     /// Sum over trees of (count − expected)² / expected.
-    fn chi_square(
-        distribution: &TreeDistribution,
-        count: usize,
-        mut draw: impl FnMut() -> Tree,
-    ) -> f64 {
+    fn chi_square(distribution: &TreeDistribution, count: usize, mut draw: impl FnMut() -> Tree) -> f64 {
         let mut counts = BTreeMap::new();
         for _ in 0..count {
             *counts.entry(draw()).or_insert(0_u32) += 1;
@@ -120,16 +113,13 @@ mod tests {
         // 15 degrees of freedom: 37.7 is exceeded once in a thousand.
         let by_walk = chi_square(&distribution, 40_000, || sample(log_weights, &mut rng));
         assert!(by_walk < 37.7, "{by_walk}");
-        let by_parents = chi_square(&distribution, 40_000, || {
-            parent_by_parent(log_weights, &mut rng)
-        });
+        let by_parents = chi_square(&distribution, 40_000, || parent_by_parent(log_weights, &mut rng));
         assert!(by_parents < 37.7, "{by_parents}");
         Ok(())
     }
 
     #[test]
-    fn parts_that_point_at_each_other_do_not_hang() -> Result<(), crate::structure::StructureError>
-    {
+    fn parts_that_point_at_each_other_do_not_hang() -> Result<(), crate::structure::StructureError> {
         let mut log_weights = DMatrix::from_element(3, 3, -600.0);
         log_weights[(1, 2)] = 600.0;
         log_weights[(2, 1)] = 600.0;
@@ -137,9 +127,7 @@ mod tests {
         let distribution = TreeDistribution::new(&log_weights)?;
         let mut rng = ChaCha8Rng::seed_from_u64(6);
         assert_eq!(walk(distribution.log_weights(), &mut rng), None);
-        let on_first = (0..4000)
-            .filter(|_| distribution.sample(&mut rng).parents() == [0, 1])
-            .count();
+        let on_first = (0..4000).filter(|_| distribution.sample(&mut rng).parents() == [0, 1]).count();
         // 3 : 1, four standard deviations of a binomial.
         assert!((on_first as f64 / 4000.0 - 0.75).abs() < 4.0 * (0.1875_f64 / 4000.0).sqrt());
         Ok(())

@@ -61,10 +61,7 @@ pub enum BagError {
 
 impl BagError {
     pub(super) fn io(path: &Path, source: io::Error) -> Self {
-        Self::Io {
-            path: path.to_owned(),
-            source,
-        }
+        Self::Io { path: path.to_owned(), source }
     }
 }
 
@@ -97,19 +94,13 @@ struct Metadata {
 pub(super) fn bag_files(path: &Path) -> Result<BagFiles, BagError> {
     let kind = fs::metadata(path).map_err(|source| BagError::io(path, source))?;
     if !kind.is_dir() {
-        return Ok(BagFiles {
-            paths: vec![path.to_owned()],
-            messages_are_compressed: false,
-        });
+        return Ok(BagFiles { paths: vec![path.to_owned()], messages_are_compressed: false });
     }
     let metadata_path = path.join("metadata.yaml");
     match fs::read_to_string(&metadata_path) {
         Ok(text) => from_metadata(path, &metadata_path, &text),
         Err(error) if error.kind() == io::ErrorKind::NotFound => from_listing(path),
-        Err(source) => Err(BagError::Io {
-            path: metadata_path,
-            source,
-        }),
+        Err(source) => Err(BagError::Io { path: metadata_path, source }),
     }
 }
 
@@ -118,10 +109,7 @@ pub(super) fn bag_files(path: &Path) -> Result<BagFiles, BagError> {
 pub(super) fn open_file(path: &Path) -> Result<(File, Option<io::Error>), BagError> {
     let fail = |source| BagError::io(path, source);
     let file = File::open(path).map_err(fail)?;
-    if !path
-        .extension()
-        .is_some_and(|extension| extension == "zstd" || extension == "zst")
-    {
+    if !path.extension().is_some_and(|extension| extension == "zstd" || extension == "zst") {
         return Ok((file, None));
     }
     let mut unpacked = tempfile::tempfile().map_err(fail)?;
@@ -130,68 +118,37 @@ pub(super) fn open_file(path: &Path) -> Result<(File, Option<io::Error>), BagErr
 }
 
 fn from_metadata(folder: &Path, path: &Path, text: &str) -> Result<BagFiles, BagError> {
-    let malformed = |reason: String| BagError::Metadata {
-        path: path.to_owned(),
-        reason,
-    };
+    let malformed = |reason: String| BagError::Metadata { path: path.to_owned(), reason };
     let unsupported = |key, found: &str, expected| {
-        Err(BagError::Unsupported {
-            path: path.to_owned(),
-            key,
-            found: found.to_owned(),
-            expected,
-        })
+        Err(BagError::Unsupported { path: path.to_owned(), key, found: found.to_owned(), expected })
     };
-    let metadata: MetadataFile =
-        serde_yaml_ng::from_str(text).map_err(|error| malformed(error.to_string()))?;
+    let metadata: MetadataFile = serde_yaml_ng::from_str(text).map_err(|error| malformed(error.to_string()))?;
     let metadata = metadata.rosbag2_bagfile_information;
     if !matches!(metadata.storage_identifier.as_str(), "mcap" | "") {
         return unsupported("storage_identifier", &metadata.storage_identifier, "mcap");
     }
     if !matches!(metadata.compression_format.as_str(), "zstd" | "") {
-        return unsupported(
-            "compression_format",
-            &metadata.compression_format,
-            "zstd or nothing",
-        );
+        return unsupported("compression_format", &metadata.compression_format, "zstd or nothing");
     }
     let mode = metadata.compression_mode.to_ascii_lowercase();
     if !matches!(mode.as_str(), "" | "none" | "file" | "message") {
-        return unsupported(
-            "compression_mode",
-            &metadata.compression_mode,
-            "file, message or none",
-        );
+        return unsupported("compression_mode", &metadata.compression_mode, "file, message or none");
     }
     if metadata.relative_file_paths.is_empty() {
         return Err(malformed("relative_file_paths is missing or empty".into()));
     }
-    let paths = metadata
-        .relative_file_paths
-        .iter()
-        .map(|file| existing(folder.join(file)))
-        .collect();
-    Ok(BagFiles {
-        paths,
-        messages_are_compressed: mode == "message",
-    })
+    let paths = metadata.relative_file_paths.iter().map(|file| existing(folder.join(file))).collect();
+    Ok(BagFiles { paths, messages_are_compressed: mode == "message" })
 }
 
 /// The path, or that of its compressed or decompressed sibling if only that is there: tools unpack
 /// files and leave the metadata as it was, or the other way round.
 fn existing(path: PathBuf) -> PathBuf {
-    let sibling = match path
-        .extension()
-        .is_some_and(|extension| extension == "zstd")
-    {
+    let sibling = match path.extension().is_some_and(|extension| extension == "zstd") {
         true => path.with_extension(""),
         false => PathBuf::from(format!("{}.zstd", path.display())),
     };
-    if !path.exists() && sibling.exists() {
-        sibling
-    } else {
-        path
-    }
+    if !path.exists() && sibling.exists() { sibling } else { path }
 }
 
 fn from_listing(folder: &Path) -> Result<BagFiles, BagError> {
@@ -199,26 +156,15 @@ fn from_listing(folder: &Path) -> Result<BagFiles, BagError> {
     let mut paths = Vec::new();
     for entry in entries {
         let path = entry.map_err(|source| BagError::io(folder, source))?.path();
-        let name = path
-            .file_name()
-            .map(|name| name.to_string_lossy().into_owned())
-            .unwrap_or_default();
-        if [".mcap", ".mcap.zstd", ".mcap.zst"]
-            .iter()
-            .any(|ending| name.ends_with(ending))
-        {
+        let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        if [".mcap", ".mcap.zstd", ".mcap.zst"].iter().any(|ending| name.ends_with(ending)) {
             paths.push(path);
         }
     }
     if paths.is_empty() {
-        return Err(BagError::NoBag {
-            path: folder.to_owned(),
-        });
+        return Err(BagError::NoBag { path: folder.to_owned() });
     }
     // bag_2 before bag_10.
     paths.sort_by_key(|path| (path.as_os_str().len(), path.clone()));
-    Ok(BagFiles {
-        paths,
-        messages_are_compressed: false,
-    })
+    Ok(BagFiles { paths, messages_are_compressed: false })
 }

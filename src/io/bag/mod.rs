@@ -80,13 +80,7 @@ pub struct Damage {
 
 impl fmt::Display for Damage {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            f,
-            "{}, byte {}: {}",
-            self.file.display(),
-            self.offset,
-            self.kind
-        )
+        write!(f, "{}, byte {}: {}", self.file.display(), self.offset, self.kind)
     }
 }
 
@@ -170,11 +164,7 @@ impl Bag {
                 Ok(found) => segments.extend(found),
                 Err(error) => {
                     let kind = DamageKind::Io(std::io::Error::other(error.to_string()));
-                    bag.damage.push(Damage {
-                        file: path,
-                        offset: 0,
-                        kind,
-                    });
+                    bag.damage.push(Damage { file: path, offset: 0, kind });
                     first_error.get_or_insert(error);
                 }
             }
@@ -220,10 +210,7 @@ impl Bag {
         let Some(map) = map else {
             return Err(match broken_off {
                 Some(source) => fail(source),
-                None => BagError::NotMcap {
-                    path: path.to_owned(),
-                    length,
-                },
+                None => BagError::NotMcap { path: path.to_owned(), length },
             });
         };
         for topic in map.channels.by_id.values() {
@@ -234,35 +221,18 @@ impl Bag {
                 *counts.entry(TopicInfo::clone(topic)).or_default() += count;
             }
         }
-        let damage = |(offset, kind)| Damage {
-            file: path.to_owned(),
-            offset,
-            kind,
-        };
-        self.damage
-            .extend(broken_off.map(|error| damage((length, DamageKind::Io(error)))));
+        let damage = |(offset, kind)| Damage { file: path.to_owned(), offset, kind };
+        self.damage.extend(broken_off.map(|error| damage((length, DamageKind::Io(error)))));
         self.damage.extend(map.damage.into_iter().map(damage));
         let index = self.files.len();
-        self.files.push(BagFile {
-            path: path.to_owned(),
-            file,
-            channels: map.channels,
-        });
-        Ok(map
-            .segments
-            .into_iter()
-            .map(|segment| (index, segment))
-            .collect())
+        self.files.push(BagFile { path: path.to_owned(), file, channels: map.channels });
+        Ok(map.segments.into_iter().map(|segment| (index, segment)).collect())
     }
 
     /// Reads segments until the earliest message read comes before all that are not.
     fn read_ahead(&mut self) {
         while let Some((file, segment)) = self.segments.front().copied() {
-            if self
-                .pending
-                .peek()
-                .is_some_and(|Reverse(earliest)| earliest.log_time_ns < segment.start)
-            {
+            if self.pending.peek().is_some_and(|Reverse(earliest)| earliest.log_time_ns < segment.start) {
                 return;
             }
             self.segments.pop_front();
@@ -282,40 +252,24 @@ impl Bag {
         };
         let chunk = Arc::new(walk::read_segment(&mut file.file, segment)?);
         let mut unusable = Vec::new();
-        for record in (Records {
-            bytes: &chunk,
-            position: 0,
-        }) {
+        for record in (Records { bytes: &chunk, position: 0 }) {
             let (opcode, range) = record?;
             let body = chunk.get(range.clone()).unwrap_or_default();
             if opcode != op::MESSAGE {
                 file.channels.declare(opcode, body)?;
                 continue;
             }
-            let (channel, log_time_ns) =
-                records::message_header(body).ok_or(DamageKind::BadRecord { opcode })?;
+            let (channel, log_time_ns) = records::message_header(body).ok_or(DamageKind::BadRecord { opcode })?;
             match file.channels.by_id.get(&channel) {
                 Some(topic) if topic.encoding == "cdr" => {
                     let range = range.start + MESSAGE_HEADER..range.end;
-                    let message = BagMessage {
-                        topic: topic.clone(),
-                        log_time_ns,
-                        chunk: chunk.clone(),
-                        range,
-                    };
-                    self.pending.push(Reverse(Pending {
-                        log_time_ns,
-                        sequence: self.sequence,
-                        message,
-                    }));
+                    let message = BagMessage { topic: topic.clone(), log_time_ns, chunk: chunk.clone(), range };
+                    self.pending.push(Reverse(Pending { log_time_ns, sequence: self.sequence, message }));
                     self.sequence += 1;
                 }
                 Some(topic) => unusable.push((
                     channel,
-                    DamageKind::Encoding {
-                        topic: topic.name.clone(),
-                        encoding: topic.encoding.clone(),
-                    },
+                    DamageKind::Encoding { topic: topic.name.clone(), encoding: topic.encoding.clone() },
                 )),
                 None => unusable.push((channel, DamageKind::UnknownChannel(channel))),
             }
@@ -329,11 +283,7 @@ impl Bag {
     }
 
     fn report(&mut self, file_index: usize, offset: u64, kind: DamageKind) {
-        let file = self
-            .files
-            .get(file_index)
-            .map(|file| file.path.clone())
-            .unwrap_or_default();
+        let file = self.files.get(file_index).map(|file| file.path.clone()).unwrap_or_default();
         let damage = Damage { file, offset, kind };
         warn!("{damage}");
         self.damage.push(damage);
@@ -347,22 +297,11 @@ impl Bag {
         match outcome {
             Ok(()) => {
                 let range = 0..unpacked.len();
-                Some(BagMessage {
-                    chunk: Arc::new(unpacked),
-                    range,
-                    ..message
-                })
+                Some(BagMessage { chunk: Arc::new(unpacked), range, ..message })
             }
             Err(error) => {
                 let topic = message.topic.name.clone();
-                self.report(
-                    0,
-                    0,
-                    DamageKind::Message {
-                        topic,
-                        reason: error.to_string(),
-                    },
-                );
+                self.report(0, 0, DamageKind::Message { topic, reason: error.to_string() });
                 None
             }
         }

@@ -171,10 +171,7 @@ impl Iterator for Records<'_> {
     type Item = Result<(u8, std::ops::Range<usize>), DamageKind>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        let rest = self
-            .bytes
-            .get(self.position..)
-            .filter(|rest| !rest.is_empty())?;
+        let rest = self.bytes.get(self.position..).filter(|rest| !rest.is_empty())?;
         let begin = self.position + PREFIX;
         self.position = self.bytes.len();
         let (opcode, length) = match rest.first_chunk() {
@@ -231,57 +228,36 @@ pub(super) fn unpack_chunk(body: &[u8], is_cut: bool) -> Result<Vec<u8>, DamageK
     let mut fields = Fields(body);
     let mut header = || {
         fields.bytes(16)?;
-        Some((
-            fields.u64()?,
-            fields.u32()?,
-            fields.string()?,
-            fields.u64()?,
-        ))
+        Some((fields.u64()?, fields.u32()?, fields.string()?, fields.u64()?))
     };
     let (expected, saved, compression, length) = header().ok_or_else(bad_record)?;
-    let packed = match fields
-        .0
-        .get(..usize::try_from(length).unwrap_or(usize::MAX))
-    {
+    let packed = match fields.0.get(..usize::try_from(length).unwrap_or(usize::MAX)) {
         Some(packed) => packed,
         None if is_cut => fields.0,
         None => return Err(bad_record()),
     };
     if expected > MAX_CHUNK {
-        return Err(DamageKind::ChunkLength {
-            found: expected,
-            expected: MAX_CHUNK,
-        });
+        return Err(DamageKind::ChunkLength { found: expected, expected: MAX_CHUNK });
     }
     let mut unpacked = Vec::new();
     let outcome = match compression {
         "" => read_limited(packed, expected, &mut unpacked),
         "zstd" => zstd::stream::read::Decoder::with_buffer(packed)
             .and_then(|decoder| read_limited(decoder, expected, &mut unpacked)),
-        "lz4" => read_limited(
-            lz4_flex::frame::FrameDecoder::new(packed),
-            expected,
-            &mut unpacked,
-        ),
+        "lz4" => read_limited(lz4_flex::frame::FrameDecoder::new(packed), expected, &mut unpacked),
         other => return Err(DamageKind::UnknownCompression(other.to_owned())),
     };
     if is_cut {
         return Ok(unpacked);
     }
-    outcome.map_err(|error| DamageKind::Decompression {
-        compression: compression.into(),
-        reason: error.to_string(),
-    })?;
+    outcome
+        .map_err(|error| DamageKind::Decompression { compression: compression.into(), reason: error.to_string() })?;
     let found = unpacked.len() as u64;
     if found != expected {
         return Err(DamageKind::ChunkLength { found, expected });
     }
     // Zero means that the writer calculated none.
-    let calculated = if saved == 0 {
-        0
-    } else {
-        crc32fast::hash(&unpacked)
-    };
+    let calculated = if saved == 0 { 0 } else { crc32fast::hash(&unpacked) };
     if calculated != saved {
         return Err(DamageKind::ChunkCrc { saved, calculated });
     }
@@ -290,8 +266,5 @@ pub(super) fn unpack_chunk(body: &[u8], is_cut: bool) -> Result<Vec<u8>, DamageK
 
 /// Reads to the end, but at most a byte more than expected, however much would come out.
 pub(super) fn read_limited(source: impl Read, expected: u64, into: &mut Vec<u8>) -> io::Result<()> {
-    source
-        .take(expected.saturating_add(1))
-        .read_to_end(into)
-        .map(|_| ())
+    source.take(expected.saturating_add(1)).read_to_end(into).map(|_| ())
 }

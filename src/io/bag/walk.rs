@@ -57,17 +57,9 @@ impl Channels {
             self.schemas.entry(id).or_insert_with(|| name.to_owned());
         } else if opcode == op::CHANNEL {
             let record = records::channel(body).ok_or_else(bad_record)?;
-            let type_name = self
-                .schemas
-                .get(&record.schema)
-                .cloned()
-                .unwrap_or_default();
+            let type_name = self.schemas.get(&record.schema).cloned().unwrap_or_default();
             self.by_id.entry(record.id).or_insert_with(|| {
-                Arc::new(TopicInfo {
-                    name: record.topic.into(),
-                    type_name,
-                    encoding: record.encoding.into(),
-                })
+                Arc::new(TopicInfo { name: record.topic.into(), type_name, encoding: record.encoding.into() })
             });
         }
         Ok(())
@@ -100,11 +92,7 @@ pub(super) fn map_file(file: &File) -> io::Result<Option<FileMap>> {
     let summary = read_summary(&mut reader, length);
     let has_end = summary.is_some();
     let summary = summary.unwrap_or_default();
-    let mut map = FileMap {
-        channels: summary.channels,
-        counts: summary.counts,
-        ..FileMap::default()
-    };
+    let mut map = FileMap { channels: summary.channels, counts: summary.counts, ..FileMap::default() };
     let is_whole = walk(&mut reader, length, has_end, &mut map)?;
     add_indexed_chunks(&mut map.segments, &summary.chunks, length, is_whole);
     if map.counts.is_empty() {
@@ -115,44 +103,22 @@ pub(super) fn map_file(file: &File) -> io::Result<Option<FileMap>> {
 
 /// Adds the chunks that the summary knows of and the walk did not find, as a broken record hides
 /// those after it. Where the walk broke off, its last find may be what was broken.
-fn add_indexed_chunks(
-    segments: &mut Vec<Segment>,
-    chunks: &[Segment],
-    length: u64,
-    is_whole: bool,
-) {
-    let fits = |chunk: &&Segment| {
-        chunk
-            .offset
-            .checked_add(chunk.length)
-            .is_some_and(|end| end <= length)
-    };
+fn add_indexed_chunks(segments: &mut Vec<Segment>, chunks: &[Segment], length: u64, is_whole: bool) {
+    let fits = |chunk: &&Segment| chunk.offset.checked_add(chunk.length).is_some_and(|end| end <= length);
     if !is_whole {
         let last_is_indexed = |last: &mut Segment| {
-            last.kind != SegmentKind::Loose
-                && chunks
-                    .iter()
-                    .filter(fits)
-                    .any(|chunk| chunk.offset == last.offset)
+            last.kind != SegmentKind::Loose && chunks.iter().filter(fits).any(|chunk| chunk.offset == last.offset)
         };
         segments.pop_if(last_is_indexed);
     }
     let found: BTreeSet<u64> = segments.iter().map(|segment| segment.offset).collect();
-    segments.extend(
-        chunks
-            .iter()
-            .filter(fits)
-            .filter(|chunk| !found.contains(&chunk.offset)),
-    );
+    segments.extend(chunks.iter().filter(fits).filter(|chunk| !found.contains(&chunk.offset)));
 }
 
 /// Reads a segment's bytes, decompressed: a row of records.
 pub(super) fn read_segment(file: &mut File, segment: &Segment) -> Result<Vec<u8>, DamageKind> {
     if segment.length > MAX_CHUNK {
-        return Err(DamageKind::ChunkLength {
-            found: segment.length,
-            expected: MAX_CHUNK,
-        });
+        return Err(DamageKind::ChunkLength { found: segment.length, expected: MAX_CHUNK });
     }
     file.seek(SeekFrom::Start(segment.offset))?;
     let mut bytes = vec![0; segment.length as usize];
@@ -167,12 +133,7 @@ pub(super) fn read_segment(file: &mut File, segment: &Segment) -> Result<Vec<u8>
 /// Goes from record to record up to the end of the data section. `false` if the row of records
 /// breaks before, which is then in `map.damage`. `has_end`: the file has its footer, so that a
 /// record beyond the end is a wrong length, not a truncated file.
-fn walk(
-    reader: &mut BufReader<&File>,
-    length: u64,
-    has_end: bool,
-    map: &mut FileMap,
-) -> io::Result<bool> {
+fn walk(reader: &mut BufReader<&File>, length: u64, has_end: bool, map: &mut FileMap) -> io::Result<bool> {
     let mut position = MAGIC.len() as u64;
     let mut extends_loose = false;
     reader.seek(SeekFrom::Start(position))?;
@@ -194,10 +155,7 @@ fn walk(
         if is_cut || !is_record {
             let kind = match is_record && !has_end {
                 true => DamageKind::Truncated,
-                false => DamageKind::LostRecords {
-                    opcode,
-                    length: body_length,
-                },
+                false => DamageKind::LostRecords { opcode, length: body_length },
             };
             map.damage.push((position, kind));
             if opcode != op::CHUNK {
@@ -226,30 +184,14 @@ fn walk(
                 }
                 (Some((_, start)), _) => {
                     let length = PREFIX as u64 + body_length;
-                    map.segments.push(Segment {
-                        kind: SegmentKind::Loose,
-                        offset: position,
-                        length,
-                        start,
-                    });
+                    map.segments.push(Segment { kind: SegmentKind::Loose, offset: position, length, start });
                 }
-                (None, _) => map
-                    .damage
-                    .push((position, DamageKind::BadRecord { opcode })),
+                (None, _) => map.damage.push((position, DamageKind::BadRecord { opcode })),
             },
             op::CHUNK => {
-                let kind = if is_cut {
-                    SegmentKind::CutChunk
-                } else {
-                    SegmentKind::Chunk
-                };
+                let kind = if is_cut { SegmentKind::CutChunk } else { SegmentKind::Chunk };
                 if let Some(start) = Fields(&head).u64() {
-                    map.segments.push(Segment {
-                        kind,
-                        offset: begin,
-                        length: head_length,
-                        start,
-                    });
+                    map.segments.push(Segment { kind, offset: begin, length: head_length, start });
                 }
                 if is_cut {
                     return Ok(false);
@@ -285,18 +227,13 @@ fn read_summary(reader: &mut BufReader<&File>, length: u64) -> Option<Summary> {
     if opcode != op::FOOTER || tail[TAIL - MAGIC.len()..] != MAGIC || summary_start == 0 {
         return None;
     }
-    let section_length = tail_start
-        .checked_sub(summary_start)
-        .filter(|length| *length <= MAX_CHUNK)?;
+    let section_length = tail_start.checked_sub(summary_start).filter(|length| *length <= MAX_CHUNK)?;
     reader.seek(SeekFrom::Start(summary_start)).ok()?;
     let mut section = vec![0; section_length as usize];
     reader.read_exact(&mut section).ok()?;
 
     let mut summary = Summary::default();
-    for record in (Records {
-        bytes: &section,
-        position: 0,
-    }) {
+    for record in (Records { bytes: &section, position: 0 }) {
         let (opcode, range) = record.ok()?;
         let body = section.get(range)?;
         match opcode {
@@ -306,12 +243,7 @@ fn read_summary(reader: &mut BufReader<&File>, length: u64) -> Option<Summary> {
                 let (start, _end) = (fields.u64()?, fields.u64()?);
                 let offset = fields.u64()?.checked_add(PREFIX as u64)?;
                 let length = fields.u64()?.checked_sub(PREFIX as u64)?;
-                summary.chunks.push(Segment {
-                    kind: SegmentKind::Chunk,
-                    offset,
-                    length,
-                    start,
-                });
+                summary.chunks.push(Segment { kind: SegmentKind::Chunk, offset, length, start });
             }
             op::STATISTICS => {
                 let mut fields = Fields(body);
@@ -336,12 +268,7 @@ fn count_messages(file: &File, map: &mut FileMap) -> io::Result<()> {
         let Ok(bytes) = read_segment(&mut file, segment) else {
             continue;
         };
-        for (opcode, range) in (Records {
-            bytes: &bytes,
-            position: 0,
-        })
-        .flatten()
-        {
+        for (opcode, range) in (Records { bytes: &bytes, position: 0 }).flatten() {
             let body = &bytes[range];
             if opcode == op::MESSAGE {
                 if let Some((channel, _)) = records::message_header(body) {

@@ -58,15 +58,8 @@ impl BagWriter {
     ///
     /// # Errors
     /// If it cannot be created.
-    pub fn create_with(
-        path: &Path,
-        compression: Compression,
-        chunk_size: Option<u64>,
-    ) -> Result<Self, WriteError> {
-        let fail = |source| WriteError {
-            path: path.to_owned(),
-            source,
-        };
+    pub fn create_with(path: &Path, compression: Compression, chunk_size: Option<u64>) -> Result<Self, WriteError> {
+        let fail = |source| WriteError { path: path.to_owned(), source };
         let file = File::create(path).map_err(|error| fail(error.into()))?;
         let compression = match compression {
             Compression::None => None,
@@ -81,11 +74,7 @@ impl BagWriter {
             .chunk_size(chunk_size)
             .create(BufWriter::new(file))
             .map_err(fail)?;
-        Ok(Self {
-            path: path.to_owned(),
-            writer,
-            sequences: BTreeMap::new(),
-        })
+        Ok(Self { path: path.to_owned(), writer, sequences: BTreeMap::new() })
     }
 
     /// Declares a topic (absolute name) of a type whose definition is known here (see
@@ -109,11 +98,8 @@ impl BagWriter {
         definition: &str,
     ) -> Result<TopicId, WriteError> {
         let metadata = BTreeMap::from([("offered_qos_profiles".to_owned(), String::new())]);
-        let schema = self
-            .writer
-            .add_schema(type_name, "ros2msg", definition.as_bytes());
-        let channel =
-            schema.and_then(|schema| self.writer.add_channel(schema, name, "cdr", &metadata));
+        let schema = self.writer.add_schema(type_name, "ros2msg", definition.as_bytes());
+        let channel = schema.and_then(|schema| self.writer.add_channel(schema, name, "cdr", &metadata));
         channel.map(TopicId).map_err(|source| self.fail(source))
     }
 
@@ -131,15 +117,8 @@ impl BagWriter {
         let next = self.sequences.entry(topic.0).or_default();
         let sequence = *next;
         *next = next.wrapping_add(1);
-        let header = MessageHeader {
-            channel_id: topic.0,
-            sequence,
-            log_time,
-            publish_time,
-        };
-        self.writer
-            .write_to_known_channel(&header, message)
-            .map_err(|source| self.fail(source))
+        let header = MessageHeader { channel_id: topic.0, sequence, log_time, publish_time };
+        self.writer.write_to_known_channel(&header, message).map_err(|source| self.fail(source))
     }
 
     /// Writes the summary and closes the file.
@@ -147,16 +126,10 @@ impl BagWriter {
     /// # Errors
     /// If it cannot be written.
     pub fn finish(mut self) -> Result<(), WriteError> {
-        self.writer
-            .finish()
-            .map(|_| ())
-            .map_err(|source| self.fail(source))
+        self.writer.finish().map(|_| ()).map_err(|source| self.fail(source))
     }
 
     fn fail(&self, source: mcap::McapError) -> WriteError {
-        WriteError {
-            path: self.path.clone(),
-            source,
-        }
+        WriteError { path: self.path.clone(), source }
     }
 }

@@ -9,8 +9,7 @@ pub struct Drag;
 
 impl Effect for Drag {
     const NAME: &'static str = "drag";
-    const PARAMETERS: &'static [Parameter] =
-        &[Parameter::positive("coefficient", Dimension::Drag, 0.3, 1.5)];
+    const PARAMETERS: &'static [Parameter] = &[Parameter::positive("coefficient", Dimension::Drag, 0.3, 1.5)];
 
     fn damping<T: Real>(parameters: &[T], joint: &JointState<T>, declared: T) -> T {
         let rate = joint.rate;

@@ -228,8 +228,7 @@ mod tests {
                         for (i, parameter) in kind.parameters().iter().enumerate() {
                             effect.parameters[i] = parameter.physical(x[i], &SCALES);
                         }
-                        let joint =
-                            JointState { position: x[4], rate: x[5], time_s: 1.9, step_s: 1e-3 };
+                        let joint = JointState { position: x[4], rate: x[5], time_s: 1.9, step_s: 1e-3 };
                         let declared = JointForces {
                             force: Dual::constant(0.0),
                             damping: Dual::constant(2.0),

@@ -136,12 +136,7 @@ pub struct Parameter {
 
 impl Parameter {
     /// A positive parameter: median in units of its scale, standard deviation of its logarithm.
-    pub const fn positive(
-        name: &'static str,
-        dimension: Dimension,
-        median: f64,
-        log_sd: f64,
-    ) -> Self {
+    pub const fn positive(name: &'static str, dimension: Dimension, median: f64, log_sd: f64) -> Self {
         Self { name, dimension, prior: Prior::LogNormal { median, log_sd } }
     }
 
@@ -154,12 +149,8 @@ impl Parameter {
     pub fn physical<T: Real>(&self, theta: T, scales: &Scales) -> T {
         let scale = self.dimension.scale(scales);
         match self.prior {
-            Prior::LogNormal { median, log_sd } => {
-                (theta * T::constant(log_sd)).exp() * T::constant(median * scale)
-            }
-            Prior::Normal { mean, sd } => {
-                (theta * T::constant(sd) + T::constant(mean)) * T::constant(scale)
-            }
+            Prior::LogNormal { median, log_sd } => (theta * T::constant(log_sd)).exp() * T::constant(median * scale),
+            Prior::Normal { mean, sd } => (theta * T::constant(sd) + T::constant(mean)) * T::constant(scale),
         }
     }
 
@@ -167,9 +158,7 @@ impl Parameter {
     pub fn unconstrained(&self, physical: f64, scales: &Scales) -> Option<f64> {
         let relative = physical / self.dimension.scale(scales);
         match self.prior {
-            Prior::LogNormal { median, log_sd } => {
-                (relative > 0.0).then(|| (relative / median).ln() / log_sd)
-            }
+            Prior::LogNormal { median, log_sd } => (relative > 0.0).then(|| (relative / median).ln() / log_sd),
             Prior::Normal { mean, sd } => Some((relative - mean) / sd),
         }
     }

@@ -26,9 +26,6 @@ impl Effect for PositionFriction {
             let bound = declared + change;
             if bound.value() > 0.0 { bound } else { T::zero() }
         };
-        FrictionBounds {
-            against_plus: bound(declared.against_plus),
-            against_minus: bound(declared.against_minus),
-        }
+        FrictionBounds { against_plus: bound(declared.against_plus), against_minus: bound(declared.against_minus) }
     }
 }

@@ -22,9 +22,6 @@ impl Effect for Stribeck {
         let ratio = joint.rate / parameters[1];
         let share = (-(ratio * ratio)).exp();
         let bound = |moving: T| moving + (parameters[0] - moving) * share;
-        FrictionBounds {
-            against_plus: bound(declared.against_plus),
-            against_minus: bound(declared.against_minus),
-        }
+        FrictionBounds { against_plus: bound(declared.against_plus), against_minus: bound(declared.against_minus) }
     }
 }

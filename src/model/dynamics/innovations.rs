@@ -101,11 +101,7 @@ impl WindowModel<'_> {
     pub fn linearize(&self, x: &[f64], active: &[usize]) -> Result<Innovations, Failure> {
         let n = self.moving.len();
         let p = active.len();
-        let slopes_by = if n > 1 {
-            self.differences(x, active)?
-        } else {
-            self.forward(x, active)?
-        };
+        let slopes_by = if n > 1 { self.differences(x, active)? } else { self.forward(x, active)? };
         let noise = ProcessNoise::new(self, x)?;
         let observations = &self.track.observations;
         if observations.len() < 3 {
@@ -138,12 +134,8 @@ impl WindowModel<'_> {
             covariance -= &gain * spread.transpose();
             covariance = (&covariance + covariance.transpose()) * 0.5;
             let deviation = cholesky.unpack();
-            let whitened = deviation
-                .solve_lower_triangular(&innovation)
-                .ok_or(Failure::Diverged)?;
-            let whitened_slopes = deviation
-                .solve_lower_triangular(&innovation_slopes)
-                .ok_or(Failure::Diverged)?;
+            let whitened = deviation.solve_lower_triangular(&innovation).ok_or(Failure::Diverged)?;
+            let whitened_slopes = deviation.solve_lower_triangular(&innovation_slopes).ok_or(Failure::Diverged)?;
             result.half_log_determinant += deviation.diagonal().iter().map(|d| d.ln()).sum::<f64>();
             result.whitened.extend(whitened.iter());
             for row in 0..n {
@@ -153,12 +145,7 @@ impl WindowModel<'_> {
             slopes += &gain * innovation_slopes;
             result.gains.push(Gain { gain, deviation });
         }
-        if result
-            .whitened
-            .iter()
-            .chain(&result.slopes)
-            .all(|e| e.is_finite())
-        {
+        if result.whitened.iter().chain(&result.slopes).all(|e| e.is_finite()) {
             Ok(result)
         } else {
             Err(Failure::Diverged)
@@ -171,42 +158,30 @@ impl WindowModel<'_> {
         let tree = self.mechanism.tree(x, self.axes, self.frozen)?;
         let mut state = self.first_state();
         let mut all = Vec::with_capacity(n * gains.len());
-        for (k, (observation, Gain { gain, deviation })) in
-            self.track.observations.iter().zip(gains).enumerate()
-        {
+        for (k, (observation, Gain { gain, deviation })) in self.track.observations.iter().zip(gains).enumerate() {
             if k > 0 {
                 let span = [self.track.observations[k - 1].time_s, observation.time_s];
                 let run = self.advance(&tree, state.as_slice(), span)?;
                 state = DVector::from_vec(run);
             }
             let innovation = &observation.value - &observation.rows * state.rows(0, n);
-            let whitened = deviation
-                .solve_lower_triangular(&innovation)
-                .ok_or(Failure::Diverged)?;
+            let whitened = deviation.solve_lower_triangular(&innovation).ok_or(Failure::Diverged)?;
             all.extend(whitened.iter());
             state += gain * innovation;
         }
-        if all.iter().all(|e: &f64| e.is_finite()) {
-            Ok(all)
-        } else {
-            Err(Failure::Diverged)
-        }
+        if all.iter().all(|e: &f64| e.is_finite()) { Ok(all) } else { Err(Failure::Diverged) }
     }
 
     fn forward(&self, x: &[f64], active: &[usize]) -> Result<Slopes, Failure> {
         let directions = active.len() + 2 * self.moving.len();
         let chunks = (0..directions).step_by(CHUNK).map(|first| {
-            let mut parameters: Vec<DualSVec64<CHUNK>> =
-                x.iter().map(|&v| Real::constant(v)).collect();
+            let mut parameters: Vec<DualSVec64<CHUNK>> = x.iter().map(|&v| Real::constant(v)).collect();
             for (i, &at) in active.iter().enumerate() {
                 if (first..first + CHUNK).contains(&i) {
                     parameters[at] = parameters[at].derivative(i - first);
                 }
             }
-            Ok(Chunk {
-                tree: self.mechanism.tree(&parameters, self.axes, self.frozen)?,
-                first,
-            })
+            Ok(Chunk { tree: self.mechanism.tree(&parameters, self.axes, self.frozen)?, first })
         });
         Ok(Slopes::Forward(chunks.collect::<Result<_, Failure>>()?))
     }
@@ -218,10 +193,7 @@ impl WindowModel<'_> {
             self.mechanism.tree(&moved, self.axes, self.frozen)
         });
         let moved = moved.collect::<Result<_, Failure>>()?;
-        Ok(Slopes::Differences(
-            self.mechanism.tree(x, self.axes, self.frozen)?,
-            moved,
-        ))
+        Ok(Slopes::Differences(self.mechanism.tree(x, self.axes, self.frozen)?, moved))
     }
 
     /// The state after a span, and its derivatives by parameters and by the state before.
@@ -237,17 +209,18 @@ impl WindowModel<'_> {
             Slopes::Differences(tree, moved) => {
                 let after = DVector::from_vec(self.advance(tree, state.as_slice(), span)?);
                 let mut derivatives = DMatrix::zeros(state.len(), p + state.len());
-                for column in 0..p + state.len() {
-                    let mut start = state.clone();
-                    let tree = match column.checked_sub(p) {
-                        Some(i) => {
-                            start[i] += DIFFERENCE;
-                            tree
-                        }
-                        None => &moved[column],
-                    };
+                let mut slope = |column: usize, tree: &Tree<f64>, start: &DVector<f64>| -> Result<(), Failure> {
                     let end = DVector::from_vec(self.advance(tree, start.as_slice(), span)?);
                     derivatives.set_column(column, &((end - &after) / DIFFERENCE));
+                    Ok(())
+                };
+                for (column, tree) in moved.iter().enumerate() {
+                    slope(column, tree, state)?;
+                }
+                for i in 0..state.len() {
+                    let mut start = state.clone();
+                    start[i] += DIFFERENCE;
+                    slope(p + i, tree, &start)?;
                 }
                 return Ok((after, derivatives));
             }
@@ -278,12 +251,7 @@ impl WindowModel<'_> {
     }
 
     /// (q, q̇) of the moving joints after a span.
-    fn advance<T: Real>(
-        &self,
-        tree: &Tree<T>,
-        state: &[T],
-        span: [f64; 2],
-    ) -> Result<Vec<T>, Failure> {
+    fn advance<T: Real>(&self, tree: &Tree<T>, state: &[T], span: [f64; 2]) -> Result<Vec<T>, Failure> {
         let n = self.moving.len();
         let mut positions = vec![T::zero(); self.mechanism.joints.len()];
         let mut rates = positions.clone();
@@ -292,26 +260,12 @@ impl WindowModel<'_> {
             rates[joint] = state[n + i];
         }
         let samples = within(&self.track.samples, span);
-        let track = self
-            .track
-            .touched
-            .map(|body| WrenchTrack::new(body, samples));
+        let track = self.track.touched.map(|body| WrenchTrack::new(body, samples));
         let step_s = if n > 1 { CHAIN_STEP_S } else { STEP_S };
-        let run = rollout(
-            tree,
-            &State::new(positions, rates),
-            track.as_slice(),
-            &span,
-            step_s,
-        )
-        .map_err(|_| Failure::Diverged)?;
+        let run = rollout(tree, &State::new(positions, rates), track.as_slice(), &span, step_s)
+            .map_err(|_| Failure::Diverged)?;
         let (positions, rates) = (run.positions(1), run.rates(1));
-        Ok(self
-            .moving
-            .iter()
-            .map(|&j| positions[j])
-            .chain(self.moving.iter().map(|&j| rates[j]))
-            .collect())
+        Ok(self.moving.iter().map(|&j| positions[j]).chain(self.moving.iter().map(|&j| rates[j])).collect())
     }
 
     fn all_positions(&self, state: &DVector<f64>) -> Vec<f64> {
@@ -334,20 +288,14 @@ impl WindowModel<'_> {
             }
             let step = self.track.positions[ahead][i - n] - first[i - n];
             // Positions of a joint at rest are equal, as the kinematic fit ties them.
-            if step.abs() > 0.02 && span_s > 0.0 {
-                step / span_s
-            } else {
-                0.0
-            }
+            if step.abs() > 0.02 && span_s > 0.0 { step / span_s } else { 0.0 }
         })
     }
 }
 
 /// The samples needed between two times.
 fn within(samples: &[WrenchSample], span: [f64; 2]) -> &[WrenchSample] {
-    let from = samples
-        .partition_point(|s| s.stamp_s <= span[0])
-        .saturating_sub(1);
+    let from = samples.partition_point(|s| s.stamp_s <= span[0]).saturating_sub(1);
     let to = (samples.partition_point(|s| s.stamp_s < span[1]) + 1).min(samples.len());
     &samples[from.min(to)..to]
 }
@@ -374,12 +322,7 @@ impl ProcessNoise {
     }
 
     /// Covariance that (q, q̇) gather over a span.
-    fn over(
-        &self,
-        span: [f64; 2],
-        q: &[f64],
-        model: &WindowModel<'_>,
-    ) -> Result<DMatrix<f64>, Failure> {
+    fn over(&self, span: [f64; 2], q: &[f64], model: &WindowModel<'_>) -> Result<DMatrix<f64>, Failure> {
         let n = model.moving.len();
         let track = model.track;
         let mut density = DMatrix::from_fn(n, n, |i, j| if i == j { self.floor[i] } else { 0.0 });
@@ -390,8 +333,7 @@ impl ProcessNoise {
             let mut at = Some(touched);
             while let Some(joint) = at {
                 if let Some(i) = model.moving.iter().position(|&m| m == joint) {
-                    levers[i] =
-                        screws[joint].angular.cross(&sample.point_in_world) + screws[joint].linear;
+                    levers[i] = screws[joint].angular.cross(&sample.point_in_world) + screws[joint].linear;
                 }
                 at = model.mechanism.joints[joint].joint.parent;
             }
@@ -408,9 +350,7 @@ impl ProcessNoise {
         let density = &inverse * density * inverse * model.noise_scale;
         let h = span[1] - span[0];
         let share = [[h * h * h / 3.0, h * h / 2.0], [h * h / 2.0, h]];
-        Ok(DMatrix::from_fn(2 * n, 2 * n, |i, j| {
-            share[i / n][j / n] * density[(i % n, j % n)]
-        }))
+        Ok(DMatrix::from_fn(2 * n, 2 * n, |i, j| share[i / n][j / n] * density[(i % n, j % n)]))
     }
 }
 
@@ -418,8 +358,5 @@ impl ProcessNoise {
 pub fn normal_equations(innovations: &Innovations, width: usize) -> (DMatrix<f64>, DVector<f64>) {
     let jacobian = DMatrix::from_row_slice(innovations.whitened.len(), width, &innovations.slopes);
     let residual = DVector::from_column_slice(&innovations.whitened);
-    (
-        jacobian.transpose() * &jacobian,
-        jacobian.transpose() * residual,
-    )
+    (jacobian.transpose() * &jacobian, jacobian.transpose() * residual)
 }

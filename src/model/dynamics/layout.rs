@@ -78,23 +78,13 @@ pub struct JointModel {
 impl JointModel {
     /// How many numbers the joint has.
     pub fn size(&self) -> usize {
-        SIZE + self
-            .effects
-            .iter()
-            .map(|kind| kind.parameters().len())
-            .sum::<usize>()
+        SIZE + self.effects.iter().map(|kind| kind.parameters().len()).sum::<usize>()
     }
 
     /// The numbers that the equations of motion hold.
     pub fn active(&self) -> Vec<usize> {
         let mut active = vec![DAMPING, FRICTION, INERTIA];
-        active.extend(
-            [LOWER, UPPER]
-                .into_iter()
-                .zip(self.stops)
-                .filter(|(_, there)| *there)
-                .map(|(i, _)| i),
-        );
+        active.extend([LOWER, UPPER].into_iter().zip(self.stops).filter(|(_, there)| *there).map(|(i, _)| i));
         if self.center_shows && self.joint.joint_type == JointType::Revolute {
             active.push(MASS);
         }
@@ -108,9 +98,7 @@ impl JointModel {
     /// The foot of the hull's centre on the axis (of a hinge), or the centre itself.
     fn foot(&self, axis: &Axis) -> Vector3<f64> {
         match self.joint.joint_type {
-            JointType::Revolute => {
-                axis.point + axis.direction * axis.direction.dot(&(self.hull.center - axis.point))
-            }
+            JointType::Revolute => axis.point + axis.direction * axis.direction.dot(&(self.hull.center - axis.point)),
             _ => self.hull.center,
         }
     }
@@ -164,8 +152,8 @@ impl JointModel {
     /// The body's inertial properties at the reference configuration from the joint's numbers.
     fn inertia<T: Real>(&self, x: &[T], axis: &Axis) -> (T, Vector3<T>, Matrix3<T>) {
         let shape = self.shape();
-        let arm = self.center_basis[0].map(T::constant) * x[CENTER]
-            + self.center_basis[1].map(T::constant) * x[CENTER + 1];
+        let arm =
+            self.center_basis[0].map(T::constant) * x[CENTER] + self.center_basis[1].map(T::constant) * x[CENTER + 1];
         match self.joint.joint_type {
             JointType::Revolute => {
                 let mass = x[MASS].exp();
@@ -173,17 +161,12 @@ impl JointModel {
                 let com = self.foot(axis).map(T::constant) + arm;
                 let along = T::constant(n.dot(&(shape * n)));
                 let about_axis = x[INERTIA].exp() - (arm.norm_squared() + along) * mass;
-                let about_com = shape.map(T::constant) * mass
-                    + (n * n.transpose()).map(T::constant) * about_axis;
+                let about_com = shape.map(T::constant) * mass + (n * n.transpose()).map(T::constant) * about_axis;
                 (mass, com, about_com)
             }
             _ => {
                 let mass = x[INERTIA].exp();
-                (
-                    mass,
-                    self.hull.center.map(T::constant) + arm,
-                    shape.map(T::constant) * mass,
-                )
+                (mass, self.hull.center.map(T::constant) + arm, shape.map(T::constant) * mass)
             }
         }
     }
@@ -192,20 +175,11 @@ impl JointModel {
         let mut parameters = JointParameters::new(x[DAMPING].exp(), x[FRICTION].exp());
         parameters.lower = self.stops[0].then(|| Limit::at(x[LOWER]));
         parameters.upper = self.stops[1].then(|| Limit::at(x[UPPER]));
-        let scales = Scales {
-            force: self.scales.force,
-            rate: self.scales.rate,
-            position: 0.3,
-            duration_s: 4.0,
-        };
+        let scales = Scales { force: self.scales.force, rate: self.scales.rate, position: 0.3, duration_s: 4.0 };
         let mut at = SIZE;
         for kind in &self.effects {
-            let values: Vec<T> = kind
-                .parameters()
-                .iter()
-                .enumerate()
-                .map(|(i, p)| p.physical(x[at + i], &scales))
-                .collect();
+            let values: Vec<T> =
+                kind.parameters().iter().enumerate().map(|(i, p)| p.physical(x[at + i], &scales)).collect();
             at += values.len();
             parameters.effects.push(AttachedEffect::new(*kind, &values));
         }
@@ -230,46 +204,26 @@ impl Mechanism {
 
     /// The tree of one body per joint, at the configuration where the `frozen` joints are at their
     /// positions, and fixed, and the others at zero.
-    pub fn tree<T: Real>(
-        &self,
-        x: &[T],
-        axes: &[Axis],
-        frozen: &[Option<f64>],
-    ) -> Result<Tree<T>, Failure> {
+    pub fn tree<T: Real>(&self, x: &[T], axes: &[Axis], frozen: &[Option<f64>]) -> Result<Tree<T>, Failure> {
         let mut carried: Vec<Pose> = Vec::with_capacity(self.joints.len());
         let mut bodies: Vec<Body<T>> = Vec::with_capacity(self.joints.len());
         let mut at = 0;
         for (k, model) in self.joints.iter().enumerate() {
             let own = &x[at..at + model.size()];
             at += model.size();
-            let parent = model
-                .joint
-                .parent
-                .map_or_else(Pose::identity, |p| carried[p]);
-            let screw = KinematicJoint {
-                axis: axes[k],
-                ..model.joint
-            }
-            .screw();
+            let parent = model.joint.parent.map_or_else(Pose::identity, |p| carried[p]);
+            let screw = KinematicJoint { axis: axes[k], ..model.joint }.screw();
             let (mass, com, about_com) = model.inertia(own, &axes[k]);
             let here = frozen[k].map_or(parent, |q| parent * screw.displacement(q));
             let pose = Pose::constant(&here);
             let body = Body {
                 parent: model.joint.parent,
-                joint: if frozen[k].is_some() {
-                    JointType::Rigid
-                } else {
-                    model.joint.joint_type
-                },
+                joint: if frozen[k].is_some() { JointType::Rigid } else { model.joint.joint_type },
                 screw: Screw(parent.adjoint(&screw.0).map(T::constant)),
                 mass,
                 com_in_world: pose.transform_point(&com),
                 inertia_about_com: pose.rotation * about_com * pose.rotation.transpose(),
-                parameters: if frozen[k].is_some() {
-                    JointParameters::default()
-                } else {
-                    model.parameters(own)
-                },
+                parameters: if frozen[k].is_some() { JointParameters::default() } else { model.parameters(own) },
             };
             bodies.push(body);
             carried.push(here);
@@ -309,15 +263,11 @@ pub fn joint_models(
             let carried = joint.parent.is_some();
             let revolute = joint.joint_type == JointType::Revolute;
             // A hinge within .5° of gravity is loaded by less than a hundredth of the weight.
-            let loaded =
-                revolute && joint.axis.direction.cross(gravity).norm() > 0.01 * gravity.norm();
+            let loaded = revolute && joint.axis.direction.cross(gravity).norm() > 0.01 * gravity.norm();
             let (center_shows, across) = if revolute {
                 (loaded || carried, joint.axis.direction)
             } else {
-                (
-                    hinge_above(k).is_some(),
-                    hinge_above(k).unwrap_or(joint.axis.direction),
-                )
+                (hinge_above(k).is_some(), hinge_above(k).unwrap_or(joint.axis.direction))
             };
             let (first, second) = orthonormal_pair(&across);
             JointModel {

@@ -110,48 +110,30 @@ impl DynamicsLearner {
             belief: Belief::default(),
             joints: BTreeMap::new(),
             windows: Vec::new(),
-            mechanism: Mechanism {
-                joints: Vec::new(),
-                gravity,
-            },
+            mechanism: Mechanism { joints: Vec::new(), gravity },
         }
     }
 
     /// Learns the newest window, and older ones again as the budget allows.
-    pub fn learn_window(
-        &mut self,
-        fit: &KinematicFit,
-        input: &DynamicsInput<'_>,
-    ) -> WindowInference {
-        self.windows
-            .resize_with(input.windows.len(), WindowMemory::default);
+    pub fn learn_window(&mut self, fit: &KinematicFit, input: &DynamicsInput<'_>) -> WindowInference {
+        self.windows.resize_with(input.windows.len(), WindowMemory::default);
         let Some(newest) = input.windows.len().checked_sub(1) else {
             return WindowInference::default();
         };
         self.windows[newest].contacts = input.contacts.to_vec();
         if let Err(failure) = self.follow(fit, input) {
-            return WindowInference {
-                failure: Some(failure),
-                ..WindowInference::default()
-            };
+            return WindowInference { failure: Some(failure), ..WindowInference::default() };
         }
         let mut result = self
             .learn(newest, fit, input, STEPS)
-            .unwrap_or_else(|failure| WindowInference {
-                failure: Some(failure),
-                ..WindowInference::default()
-            });
+            .unwrap_or_else(|failure| WindowInference { failure: Some(failure), ..WindowInference::default() });
         let mut budget = REVISIT_STEPS;
         for window in self.stale(newest) {
             if budget == 0 {
                 break;
             }
             // A warm start needs two or three steps.
-            let steps = if self.windows[window].learned {
-                3
-            } else {
-                STEPS
-            };
+            let steps = if self.windows[window].learned { 3 } else { STEPS };
             let spent = self.learn(window, fit, input, steps).map_or(1, |r| r.steps);
             budget = budget.saturating_sub(spent.max(1));
             result.steps += spent;
@@ -190,21 +172,13 @@ impl DynamicsLearner {
                 self.joints.insert(joint.child, memory);
             }
         }
-        let gone: Vec<Label> = self
-            .joints
-            .keys()
-            .copied()
-            .filter(|l| !present.contains(l))
-            .collect();
+        let gone: Vec<Label> = self.joints.keys().copied().filter(|l| !present.contains(l)).collect();
         for label in gone {
             self.forget(label);
             self.joints.remove(&label);
         }
         for (k, joint) in fit.joints.iter().enumerate() {
-            let known = self
-                .joints
-                .get(&joint.child)
-                .is_some_and(|m| m.scales.is_some());
+            let known = self.joints.get(&joint.child).is_some_and(|m| m.scales.is_some());
             if !known
                 && let Some(scales) = self.first_scales(k, fit, input)
                 && let Some(memory) = self.joints.get_mut(&joint.child)
@@ -229,25 +203,10 @@ impl DynamicsLearner {
     /// The mechanism of the current joints, and the priors of new ones.
     fn rebuild(&mut self, fit: &KinematicFit) -> Result<(), Failure> {
         let memory = |joint: &KinematicJoint| self.joints.get(&joint.child);
-        let default = JointScales {
-            force: 1.0,
-            rate: 0.2,
-        };
-        let scales: Vec<_> = fit
-            .joints
-            .iter()
-            .map(|j| memory(j).and_then(|m| m.scales).unwrap_or(default))
-            .collect();
-        let stops: Vec<_> = fit
-            .joints
-            .iter()
-            .map(|j| memory(j).map_or([false; 2], |m| m.stops))
-            .collect();
-        let hull = |joint: &KinematicJoint| {
-            memory(joint)
-                .and_then(|m| m.hull.clone())
-                .unwrap_or_else(|| ball(joint))
-        };
+        let default = JointScales { force: 1.0, rate: 0.2 };
+        let scales: Vec<_> = fit.joints.iter().map(|j| memory(j).and_then(|m| m.scales).unwrap_or(default)).collect();
+        let stops: Vec<_> = fit.joints.iter().map(|j| memory(j).map_or([false; 2], |m| m.stops)).collect();
+        let hull = |joint: &KinematicJoint| memory(joint).and_then(|m| m.hull.clone()).unwrap_or_else(|| ball(joint));
         let mut models = joint_models(&fit.joints, hull, &scales, &stops, &self.gravity);
         for model in &mut models {
             let label = model.joint.child;
@@ -262,35 +221,22 @@ impl DynamicsLearner {
                 None => model.prior(memory.stop_positions)?,
             };
             let size = model.size();
-            self.belief.set_prior(
-                block,
-                Factor {
-                    blocks: vec![(block, size)],
-                    gaussian,
-                },
-            );
+            self.belief.set_prior(block, Factor { blocks: vec![(block, size)], gaussian });
         }
-        self.mechanism = Mechanism {
-            joints: models,
-            gravity: self.gravity,
-        };
+        self.mechanism = Mechanism { joints: models, gravity: self.gravity };
         Ok(())
     }
 
     fn set_kinematic_prior(&mut self, fit: &KinematicFit) -> Result<(), Failure> {
-        let mut blocks: Vec<(Block, usize)> = fit
-            .joints
-            .iter()
-            .map(|j| (Block::Axis(j.child), j.axis_parameters()))
-            .collect();
+        let mut blocks: Vec<(Block, usize)> =
+            fit.joints.iter().map(|j| (Block::Axis(j.child), j.axis_parameters())).collect();
         blocks.push((Block::ToolOffset, 3));
         let mut covariance = kinematic_covariance(fit);
         for i in 0..covariance.nrows() {
             covariance[(i, i)] += 1e-12;
         }
         let gaussian = Gaussian::from_moments(&DVector::zeros(covariance.nrows()), &covariance)?;
-        self.belief
-            .set_prior(Block::ToolOffset, Factor { blocks, gaussian });
+        self.belief.set_prior(Block::ToolOffset, Factor { blocks, gaussian });
         Ok(())
     }
 
@@ -308,11 +254,7 @@ impl DynamicsLearner {
             for (block, length) in &factor.blocks {
                 match block {
                     Block::Axis(label) => {
-                        let new = fit
-                            .joints
-                            .iter()
-                            .find(|j| j.child == *label)
-                            .map(|j| j.axis);
+                        let new = fit.joints.iter().find(|j| j.child == *label).map(|j| j.axis);
                         if let (Some(old), Some(new)) = (memory.axes.get(label).copied(), new) {
                             let (turn, moved) = axis_change(&old, &new);
                             for i in 0..*length {
@@ -355,19 +297,13 @@ impl DynamicsLearner {
             k
         };
         let touched = touched_label(&self.windows[window].contacts);
-        let branch = touched
-            .and_then(|label| fit.joints.iter().position(|j| j.child == label))
-            .map(root);
+        let branch = touched.and_then(|label| fit.joints.iter().position(|j| j.child == label)).map(root);
         let mut moving = Vec::new();
         let mut frozen = vec![None; fit.joints.len()];
         for (k, joint) in fit.joints.iter().enumerate() {
             let positions = &fit.positions[window][k];
             let (low, high) = range(positions);
-            let rest = if joint.joint_type == JointType::Revolute {
-                REST_ANGLE
-            } else {
-                REST
-            };
+            let rest = if joint.joint_type == JointType::Revolute { REST_ANGLE } else { REST };
             if high - low > rest && branch == Some(root(k)) {
                 moving.push(k);
             } else {
@@ -397,12 +333,7 @@ impl DynamicsLearner {
     }
 
     /// Force and rate of a joint in the first window that moved it.
-    fn first_scales(
-        &self,
-        joint: usize,
-        fit: &KinematicFit,
-        input: &DynamicsInput<'_>,
-    ) -> Option<JointScales> {
+    fn first_scales(&self, joint: usize, fit: &KinematicFit, input: &DynamicsInput<'_>) -> Option<JointScales> {
         let kinematics = kinematics_of(fit);
         (0..input.windows.len()).find_map(|w| {
             let (moving, _) = self.moving(w, fit);
@@ -422,12 +353,7 @@ impl DynamicsLearner {
     }
 
     /// |Sᵀ w| of the samples on a joint, at the reference configuration of its ancestors.
-    fn generalized_forces(
-        &self,
-        joint: usize,
-        fit: &KinematicFit,
-        track: &super::track::JointTrack,
-    ) -> Vec<f64> {
+    fn generalized_forces(&self, joint: usize, fit: &KinematicFit, track: &super::track::JointTrack) -> Vec<f64> {
         let mut above = track.touched;
         while above.is_some_and(|k| k != joint) {
             above = above.and_then(|k| fit.joints[k].parent);
@@ -463,11 +389,7 @@ impl DynamicsLearner {
         let mut fitted = self.fit_window(window, fit, input, &moving, &frozen, (steps, None))?;
         let mut spent = fitted.1.steps;
         // Stops where the joint arrived at the end of its range.
-        let halts = if self.windows[window].learned {
-            Vec::new()
-        } else {
-            self.halts(window, fit, &moving)
-        };
+        let halts = if self.windows[window].learned { Vec::new() } else { self.halts(window, fit, &moving) };
         for (joint, side, position) in halts {
             let label = fit.joints[joint].child;
             let before = self.joints.get(&label).cloned();
@@ -479,9 +401,7 @@ impl DynamicsLearner {
             let trial = self.fit_window(window, fit, input, &moving, &frozen, (6, Some(&fitted.1)));
             spent += trial.as_ref().map_or(0, |t| t.1.steps);
             match trial {
-                Ok(trial) if trial.1.log_predictive > fitted.1.log_predictive + STOP_EVIDENCE => {
-                    fitted = trial
-                }
+                Ok(trial) if trial.1.log_predictive > fitted.1.log_predictive + STOP_EVIDENCE => fitted = trial,
                 _ => {
                     if let Some(before) = before {
                         self.joints.insert(label, before);
@@ -500,8 +420,7 @@ impl DynamicsLearner {
         memory.axes = fit.joints.iter().map(|j| (j.child, j.axis)).collect();
         memory.tool_offset = fit.tool_offset;
         let observations = result.innovations.whitened.len();
-        let log_predictive =
-            result.log_predictive - 0.5 * observations as f64 * std::f64::consts::TAU.ln();
+        let log_predictive = result.log_predictive - 0.5 * observations as f64 * std::f64::consts::TAU.ln();
         Ok(WindowInference {
             steps: spent,
             elbo: log_predictive,
@@ -519,59 +438,31 @@ impl DynamicsLearner {
         fit: &KinematicFit,
         input: &DynamicsInput<'_>,
     ) -> Result<WindowInference, Failure> {
-        let track = joint_track(&self.source(window, &[0], fit, input), &kinematics_of(fit))
-            .ok_or(Failure::NoInformation)?;
+        let track =
+            joint_track(&self.source(window, &[0], fit, input), &kinematics_of(fit)).ok_or(Failure::NoInformation)?;
         let touched = track.touched.ok_or(Failure::NoInformation)?;
         let label = fit.joints[touched].child;
         // The load that stood for a tenth of the contact: not a spike of noise.
-        let load = quantile(self.generalized_forces(touched, fit, &track), 0.9)
-            .ok_or(Failure::NoInformation)?;
+        let load = quantile(self.generalized_forces(touched, fit, &track), 0.9).ok_or(Failure::NoInformation)?;
         let block = Block::Dynamics(label);
         let (mean, covariance) = self.belief.product(Some(&window)).moments(&[block])?;
         let friction = super::layout::FRICTION;
-        let gaussian = load_factor(
-            load.ln(),
-            mean[friction],
-            covariance[(friction, friction)].sqrt(),
-            mean.len(),
-        );
-        self.belief.replace(
-            window,
-            Factor {
-                blocks: vec![(block, mean.len())],
-                gaussian,
-            },
-        );
+        let gaussian = load_factor(load.ln(), mean[friction], covariance[(friction, friction)].sqrt(), mean.len());
+        self.belief.replace(window, Factor { blocks: vec![(block, mean.len())], gaussian });
         self.windows[window].learned = true;
-        Ok(WindowInference {
-            steps: 1,
-            ..WindowInference::default()
-        })
+        Ok(WindowInference { steps: 1, ..WindowInference::default() })
     }
 
     /// The (joint, side, position) where a joint arrived at an end of all its positions so far.
-    fn halts(
-        &self,
-        window: usize,
-        fit: &KinematicFit,
-        moving: &[usize],
-    ) -> Vec<(usize, usize, f64)> {
+    fn halts(&self, window: usize, fit: &KinematicFit, moving: &[usize]) -> Vec<(usize, usize, f64)> {
         let mut halts = Vec::new();
         for &k in moving {
             let joint = &fit.joints[k];
             let Some(memory) = self.joints.get(&joint.child) else {
                 continue;
             };
-            let near = if joint.joint_type == JointType::Revolute {
-                0.02
-            } else {
-                0.005
-            };
-            let all: Vec<f64> = fit
-                .positions
-                .iter()
-                .flat_map(|w| w[k].iter().copied())
-                .collect();
+            let near = if joint.joint_type == JointType::Revolute { 0.02 } else { 0.005 };
+            let all: Vec<f64> = fit.positions.iter().flat_map(|w| w[k].iter().copied()).collect();
             let (low, high) = range(&all);
             for (side, end) in [low, high].into_iter().enumerate() {
                 if memory.stops[side] {
@@ -580,9 +471,7 @@ impl DynamicsLearner {
                 let positions = &fit.positions[window][k];
                 let at_end = |i: usize| (positions[i] - end).abs() < near;
                 let arrival = (1..positions.len()).find(|&i| at_end(i) && !at_end(i - 1));
-                if arrival
-                    .is_some_and(|i| (i..positions.len()).take_while(|&i| at_end(i)).count() >= 2)
-                {
+                if arrival.is_some_and(|i| (i..positions.len()).take_while(|&i| at_end(i)).count() >= 2) {
                     halts.push((k, side, end));
                 }
             }
@@ -611,28 +500,18 @@ impl DynamicsLearner {
             active.extend(own.into_iter().map(|i| i + self.mechanism.offset(joint)));
         }
         let cavity = self.belief.product(Some(&window));
-        let blocks: Vec<Block> = self
-            .mechanism
-            .joints
-            .iter()
-            .map(|m| Block::Dynamics(m.joint.child))
-            .collect();
+        let blocks: Vec<Block> = self.mechanism.joints.iter().map(|m| Block::Dynamics(m.joint.child)).collect();
         let conditional = given_kinematics(&cavity, &blocks)?;
         let (mean, _) = conditional.moments()?;
         let prior = conditional.marginal(&active)?;
         let (start, covariance) = prior.moments()?;
         let starts = match warm {
             Some(warm) => vec![DVector::from_fn(active.len(), |i, _| {
-                warm.active
-                    .iter()
-                    .position(|a| *a == active[i])
-                    .map_or(start[i], |k| warm.solution.point[k])
+                warm.active.iter().position(|a| *a == active[i]).map_or(start[i], |k| warm.solution.point[k])
             })],
             None => starts(&start, &covariance, &active, &self.mechanism, moving),
         };
-        let noise_scale = warm
-            .map(|w| w.noise_scale)
-            .or(self.windows[window].noise_scale);
+        let noise_scale = warm.map(|w| w.noise_scale).or(self.windows[window].noise_scale);
         let window_fit = WindowFit {
             mechanism: &self.mechanism,
             source,
@@ -643,11 +522,7 @@ impl DynamicsLearner {
             base: mean.iter().copied().collect(),
         };
         let fitted = window_fit.fit(&prior, &starts, noise_scale, steps)?;
-        let deviations = self.deviations(
-            fit,
-            &involved,
-            input.use_tool || !self.windows[window].contacts.is_empty(),
-        );
+        let deviations = self.deviations(fit, &involved, input.use_tool || !self.windows[window].contacts.is_empty());
         let sensitivity = window_fit.sensitivity(&fitted, &deviations);
         Ok((self.factor(fit, &window_fit, &fitted, &sensitivity), fitted))
     }
@@ -672,31 +547,18 @@ impl DynamicsLearner {
     }
 
     /// Standard deviations of the kinematic numbers that matter to a window; zero for the others.
-    fn deviations(
-        &self,
-        fit: &KinematicFit,
-        involved: &[(usize, bool)],
-        touched: bool,
-    ) -> Vec<f64> {
+    fn deviations(&self, fit: &KinematicFit, involved: &[(usize, bool)], touched: bool) -> Vec<f64> {
         let covariance = kinematic_covariance(fit);
         let mut deviations = vec![0.0; covariance.nrows()];
         for &(joint, whole) in involved {
             let start = fit.axis_offset(joint);
             for i in start..start + fit.joints[joint].axis_parameters() {
-                deviations[i] = if whole {
-                    covariance[(i, i)].max(0.0).sqrt()
-                } else {
-                    0.0
-                };
+                deviations[i] = if whole { covariance[(i, i)].max(0.0).sqrt() } else { 0.0 };
             }
         }
         let start = deviations.len() - 3;
         for (i, deviation) in deviations.iter_mut().enumerate().skip(start) {
-            *deviation = if touched {
-                covariance[(i, i)].max(0.0).sqrt()
-            } else {
-                0.0
-            };
+            *deviation = if touched { covariance[(i, i)].max(0.0).sqrt() } else { 0.0 };
         }
         deviations
     }
@@ -714,12 +576,8 @@ impl DynamicsLearner {
         let mut total = 0;
         for (k, model) in self.mechanism.joints.iter().enumerate() {
             let offset = self.mechanism.offset(k);
-            let own: Vec<usize> = window
-                .active
-                .iter()
-                .copied()
-                .filter(|i| (offset..offset + model.size()).contains(i))
-                .collect();
+            let own: Vec<usize> =
+                window.active.iter().copied().filter(|i| (offset..offset + model.size()).contains(i)).collect();
             if !own.is_empty() {
                 blocks.push((Block::Dynamics(model.joint.child), model.size()));
                 places.extend(own.iter().map(|i| total + i - offset));
@@ -728,11 +586,8 @@ impl DynamicsLearner {
         }
         // Kinematic numbers that do not matter stay out of the site.
         let mut columns: Vec<usize> = Vec::new();
-        let kinematic = fit
-            .joints
-            .iter()
-            .map(|j| (Block::Axis(j.child), j.axis_parameters()))
-            .chain([(Block::ToolOffset, 3)]);
+        let kinematic =
+            fit.joints.iter().map(|j| (Block::Axis(j.child), j.axis_parameters())).chain([(Block::ToolOffset, 3)]);
         let mut column = 0;
         for (block, length) in kinematic {
             if (column..column + length).any(|c| sensitivity.column(c).amax() > 0.0) {
@@ -750,16 +605,12 @@ impl DynamicsLearner {
         let linear = &fitted.solution.linearization;
         let gaussian = Gaussian {
             precision: &linear.curvature / fitted.reduction,
-            information: (&linear.curvature * &fitted.solution.point - &linear.gradient)
-                / fitted.reduction,
+            information: (&linear.curvature * &fitted.solution.point - &linear.gradient) / fitted.reduction,
         }
         .pull_back(&map, &DVector::zeros(p));
         let mut whole = Gaussian::flat(total + columns.len());
         whole.multiply_at(&gaussian, &places);
-        Factor {
-            blocks,
-            gaussian: whole,
-        }
+        Factor { blocks, gaussian: whole }
     }
 }
 
@@ -799,23 +650,14 @@ fn given_kinematics(joint: &Joint<Block>, blocks: &[Block]) -> Result<Gaussian, 
     let places: Vec<usize> = blocks.iter().flat_map(|b| joint.places(b)).collect();
     let n = places.len();
     let gaussian = Gaussian {
-        precision: DMatrix::from_fn(n, n, |i, j| {
-            joint.gaussian.precision[(places[i], places[j])]
-        }),
+        precision: DMatrix::from_fn(n, n, |i, j| joint.gaussian.precision[(places[i], places[j])]),
         information: DVector::from_fn(n, |i, _| joint.gaussian.information[places[i]]),
     };
-    if n == 0 {
-        Err(Failure::NoInformation)
-    } else {
-        Ok(gaussian)
-    }
+    if n == 0 { Err(Failure::NoInformation) } else { Ok(gaussian) }
 }
 
 fn kinematics_of(fit: &KinematicFit) -> TrackKinematics {
-    TrackKinematics {
-        axes: fit.joints.iter().map(|j| j.axis).collect(),
-        tool_offset: fit.tool_offset,
-    }
+    TrackKinematics { axes: fit.joints.iter().map(|j| j.axis).collect(), tool_offset: fit.tool_offset }
 }
 
 /// Covariance of the axes, joint by joint, and the tool's offset, which is last in the fit's.
@@ -823,9 +665,7 @@ fn kinematic_covariance(fit: &KinematicFit) -> DMatrix<f64> {
     let axes: usize = fit.joints.iter().map(KinematicJoint::axis_parameters).sum();
     let all = fit.covariance.nrows();
     let places: Vec<usize> = (0..axes).chain(all - 3..all).collect();
-    DMatrix::from_fn(places.len(), places.len(), |i, j| {
-        fit.covariance[(places[i], places[j])]
-    })
+    DMatrix::from_fn(places.len(), places.len(), |i, j| fit.covariance[(places[i], places[j])])
 }
 
 /// Errors of an axis in the coordinates of `old`, from those in the coordinates of `new`.
@@ -833,36 +673,18 @@ fn axis_change(old: &Axis, new: &Axis) -> (DMatrix<f64>, [f64; 4]) {
     let (f0, s0) = orthonormal_pair(&old.direction);
     let (f1, s1) = orthonormal_pair(&new.direction);
     let turn = [[f0.dot(&f1), f0.dot(&s1)], [s0.dot(&f1), s0.dot(&s1)]];
-    let map = DMatrix::from_fn(4, 4, |i, j| {
-        if i / 2 == j / 2 {
-            turn[i % 2][j % 2]
-        } else {
-            0.0
-        }
-    });
+    let map = DMatrix::from_fn(4, 4, |i, j| if i / 2 == j / 2 { turn[i % 2][j % 2] } else { 0.0 });
     // A turn by a f₀ + b s₀ moves the direction by −a s₀ + b f₀.
     let along = old.direction.dot(&(new.point - old.point)) / old.direction.dot(&new.direction);
     let moved = new.point - new.direction * along - old.point;
-    (
-        map,
-        [
-            -s0.dot(&new.direction),
-            f0.dot(&new.direction),
-            f0.dot(&moved),
-            s0.dot(&moved),
-        ],
-    )
+    (map, [-s0.dot(&new.direction), f0.dot(&new.direction), f0.dot(&moved), s0.dot(&moved)])
 }
 
 /// A joint's prior with its stops where they are believed.
 fn with_stops(prior: &Gaussian, memory: &JointMemory) -> Gaussian {
     let mut gaussian = prior.clone();
     for (side, place) in [LOWER, UPPER].into_iter().enumerate() {
-        let deviation = if memory.stops[side] {
-            LIMIT_DEVIATION
-        } else {
-            1.0
-        };
+        let deviation = if memory.stops[side] { LIMIT_DEVIATION } else { 1.0 };
         gaussian.precision[(place, place)] = deviation.powi(-2);
         gaussian.information[place] = memory.stop_positions[side] * deviation.powi(-2);
     }
@@ -884,11 +706,7 @@ fn ball(joint: &KinematicJoint) -> HullProperties {
 }
 
 fn range(values: &[f64]) -> (f64, f64) {
-    values
-        .iter()
-        .fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), &x| {
-            (l.min(x), h.max(x))
-        })
+    values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), &x| (l.min(x), h.max(x)))
 }
 
 fn quantile(mut values: Vec<f64>, share: f64) -> Option<f64> {
@@ -896,7 +714,5 @@ fn quantile(mut values: Vec<f64>, share: f64) -> Option<f64> {
         return None;
     }
     values.sort_by(f64::total_cmp);
-    values
-        .get(((values.len() - 1) as f64 * share) as usize)
-        .copied()
+    values.get(((values.len() - 1) as f64 * share) as usize).copied()
 }

@@ -59,48 +59,36 @@ impl DynamicsLearner {
         if models.is_empty() {
             return Err(Failure::NoInformation);
         }
-        let blocks: Vec<Block> = models
-            .iter()
-            .map(|m| Block::Dynamics(m.joint.child))
-            .collect();
+        let blocks: Vec<Block> = models.iter().map(|m| Block::Dynamics(m.joint.child)).collect();
         let (mean, covariance) = self.belief.product(None).moments(&blocks)?;
-        let mut posterior = DynamicsPosterior {
-            joints: Vec::new(),
-            parts: Vec::new(),
-            mean,
-            covariance,
-        };
+        let mut posterior = DynamicsPosterior { joints: Vec::new(), parts: Vec::new(), mean, covariance };
         let prior_deviation = |k: usize, entry: usize| {
             let prior = self.belief.prior(&blocks[k])?.gaussian.moments().ok()?;
             Some(prior.1[(entry, entry)].sqrt())
         };
         for (k, model) in models.iter().enumerate() {
             let at = self.mechanism.offset(k);
-            let deviation = |entry: usize| {
-                posterior.covariance[(at + entry, at + entry)]
-                    .max(0.0)
-                    .sqrt()
-            };
+            let deviation = |entry: usize| posterior.covariance[(at + entry, at + entry)].max(0.0).sqrt();
             let informed = |entry: usize, deviation: f64| match prior_deviation(k, entry) {
                 Some(prior) if deviation < 0.7 * prior => InformedBy::Dynamics,
                 _ => InformedBy::Prior,
             };
             let revolute = model.joint.joint_type == JointType::Revolute;
-            let units = if revolute {
-                ["N·m·s/rad", "N·m", "kg·m²", "rad"]
-            } else {
-                ["N·s/m", "N", "kg", "m"]
-            };
+            let units = if revolute { ["N·m·s/rad", "N·m", "kg·m²", "rad"] } else { ["N·s/m", "N", "kg", "m"] };
             let log_normal = |unit: &str, entry: usize| {
-                Quantity::from_log_normal(unit, posterior.mean[at + entry], deviation(entry), informed(entry, deviation(entry)))
+                Quantity::from_log_normal(
+                    unit,
+                    posterior.mean[at + entry],
+                    deviation(entry),
+                    informed(entry, deviation(entry)),
+                )
             };
             let stop = |side: usize, entry: usize| {
                 model.stops[side].then(|| {
                     Quantity::from_normal(units[3], posterior.mean[at + entry], deviation(entry), InformedBy::Dynamics)
                 })
             };
-            let (inertia, inertia_deviation) =
-                self.joint_inertia(k, &posterior.mean, &posterior.covariance)?;
+            let (inertia, inertia_deviation) = self.joint_inertia(k, &posterior.mean, &posterior.covariance)?;
             posterior.joints.push(JointDynamics {
                 label: model.joint.child,
                 damping: log_normal(units[0], DAMPING),
@@ -149,15 +137,9 @@ impl DynamicsLearner {
     ) -> Result<(f64, f64), Failure> {
         let axes: Vec<_> = self.mechanism.joints.iter().map(|m| m.joint.axis).collect();
         let value = |x: &DVector<f64>| {
-            let tree = self
-                .mechanism
-                .tree(x.as_slice(), &axes, &vec![None; axes.len()])?;
+            let tree = self.mechanism.tree(x.as_slice(), &axes, &vec![None; axes.len()])?;
             let inertia = tree.joint_inertia(joint);
-            if inertia > 0.0 {
-                Ok(inertia.ln())
-            } else {
-                Err(Failure::Diverged)
-            }
+            if inertia > 0.0 { Ok(inertia.ln()) } else { Err(Failure::Diverged) }
         };
         let here = value(mean)?;
         let slope = DVector::from_iterator(

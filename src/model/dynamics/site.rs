@@ -10,9 +10,7 @@ use nalgebra::{DMatrix, DVector};
 use super::innovations::{Gain, Innovations, WindowModel, normal_equations};
 use super::layout::{FRICTION, Mechanism};
 use super::track::{JointTrack, TrackKinematics, TrackSource, joint_track};
-use crate::inference::{
-    Failure, Gaussian, LeastSquares, Linearization, Solution, SolverSettings, solve,
-};
+use crate::inference::{Failure, Gaussian, LeastSquares, Linearization, Solution, SolverSettings, solve};
 use crate::math::orthonormal_pair;
 use crate::model::{Axis, KinematicJoint};
 
@@ -88,11 +86,7 @@ impl LeastSquares for Problem<'_> {
         let cost = innovations.cost();
         self.gains = innovations.gains.clone();
         self.latest = innovations;
-        Ok(Linearization {
-            cost,
-            gradient,
-            curvature,
-        })
+        Ok(Linearization { cost, gradient, curvature })
     }
 
     fn cost(&mut self, x: &DVector<f64>) -> Result<f64, Failure> {
@@ -131,10 +125,7 @@ impl WindowFit<'_> {
                 break;
             }
             let mut problem = self.problem(first_scale);
-            let settings = SolverSettings {
-                steps: (steps / 3).max(3),
-                ..SolverSettings::default()
-            };
+            let settings = SolverSettings { steps: (steps / 3).max(3), ..SolverSettings::default() };
             let Ok(solution) = solve(&mut problem, prior, start, &settings) else {
                 continue;
             };
@@ -149,10 +140,7 @@ impl WindowFit<'_> {
         let rounds = if noise_scale.is_some() { 1 } else { 2 };
         for round in 0..rounds {
             let mut problem = self.problem(scale);
-            let settings = SolverSettings {
-                steps,
-                ..SolverSettings::default()
-            };
+            let settings = SolverSettings { steps, ..SolverSettings::default() };
             let solution = solve(&mut problem, prior, &point, &settings)?;
             spent += solution.steps;
             if round + 1 < rounds {
@@ -169,9 +157,7 @@ impl WindowFit<'_> {
                 active: self.active.clone(),
                 reduction: reduction(&innovations.whitened, self.source.moving.len()),
                 noise_scale: scale,
-                log_predictive: solution.log_evidence
-                    - innovations.half_log_determinant
-                    - scale_cost(scale),
+                log_predictive: solution.log_evidence - innovations.half_log_determinant - scale_cost(scale),
                 innovations,
                 solution,
                 steps: spent,
@@ -191,17 +177,12 @@ impl WindowFit<'_> {
         let mut density = |scale: f64| {
             tried += 1;
             let innovations = self.model(scale).linearize(&x, &[])?;
-            Ok::<_, Failure>(
-                -innovations.cost() - innovations.half_log_determinant - scale_cost(scale),
-            )
+            Ok::<_, Failure>(-innovations.cost() - innovations.half_log_determinant - scale_cost(scale))
         };
         let mut at = NOISE_SCALES.iter().position(|s| *s >= from).unwrap_or(0);
         let mut best = density(NOISE_SCALES[at])?;
         for direction in [1, -1_isize] {
-            while let Some(next) = at
-                .checked_add_signed(direction)
-                .filter(|i| *i < NOISE_SCALES.len())
-            {
+            while let Some(next) = at.checked_add_signed(direction).filter(|i| *i < NOISE_SCALES.len()) {
                 let trial = density(NOISE_SCALES[next])?;
                 if trial <= best {
                     break;
@@ -231,11 +212,7 @@ impl WindowFit<'_> {
         for (&at, value) in self.active.iter().zip(fitted.solution.point.iter()) {
             x[at] = *value;
         }
-        let jacobian = DMatrix::from_row_slice(
-            fitted.innovations.whitened.len(),
-            p,
-            &fitted.innovations.slopes,
-        );
+        let jacobian = DMatrix::from_row_slice(fitted.innovations.whitened.len(), p, &fitted.innovations.slopes);
         let mut hessian = jacobian.transpose() * &jacobian;
         let ridge = 1e-9 * hessian.diagonal().max() + 1e-12;
         for i in 0..p {
@@ -253,11 +230,7 @@ impl WindowFit<'_> {
             let Some(track) = joint_track(&self.source, &kinematics) else {
                 continue;
             };
-            let model = WindowModel {
-                axes: &kinematics.axes,
-                track: &track,
-                ..self.model(fitted.noise_scale)
-            };
+            let model = WindowModel { axes: &kinematics.axes, track: &track, ..self.model(fitted.noise_scale) };
             let Ok(residuals) = model.residuals(&x, &fitted.innovations.gains) else {
                 continue;
             };
@@ -266,10 +239,7 @@ impl WindowFit<'_> {
             }
             let slope = DVector::from_iterator(
                 residuals.len(),
-                residuals
-                    .iter()
-                    .zip(&fitted.innovations.whitened)
-                    .map(|(a, b)| (a - b) / step),
+                residuals.iter().zip(&fitted.innovations.whitened).map(|(a, b)| (a - b) / step),
             );
             result.set_column(column, &cholesky.solve(&(jacobian.transpose() * slope)));
         }
@@ -283,14 +253,7 @@ impl WindowFit<'_> {
         for (k, joint) in self.source.joints.iter().enumerate() {
             let count = joint.axis_parameters();
             if at < count {
-                moved.axes[k] = retracted(
-                    &KinematicJoint {
-                        axis: moved.axes[k],
-                        ..*joint
-                    },
-                    at,
-                    step,
-                );
+                moved.axes[k] = retracted(&KinematicJoint { axis: moved.axes[k], ..*joint }, at, step);
                 return moved;
             }
             at -= count;
@@ -304,21 +267,11 @@ impl WindowFit<'_> {
 fn retracted(joint: &KinematicJoint, which: usize, step: f64) -> Axis {
     let Axis { direction, point } = joint.axis;
     let (first, second) = orthonormal_pair(&direction);
-    let along = if which.is_multiple_of(2) {
-        first
-    } else {
-        second
-    };
+    let along = if which.is_multiple_of(2) { first } else { second };
     if which < 2 {
-        Axis {
-            direction: (direction + (along * step).cross(&direction)).normalize(),
-            point,
-        }
+        Axis { direction: (direction + (along * step).cross(&direction)).normalize(), point }
     } else {
-        Axis {
-            direction,
-            point: point + along * step,
-        }
+        Axis { direction, point: point + along * step }
     }
 }
 
@@ -333,12 +286,7 @@ fn reduction(whitened: &[f64], rows: usize) -> f64 {
     let variance = ((squares + VARIANCE_PRIOR) / (n + VARIANCE_PRIOR)).max(1.0);
     let correlation: f64 = (1..=6)
         .map(|lag| {
-            whitened
-                .iter()
-                .zip(whitened.iter().skip(lag * rows))
-                .map(|(a, b)| a * b)
-                .sum::<f64>()
-                / squares.max(1e-12)
+            whitened.iter().zip(whitened.iter().skip(lag * rows)).map(|(a, b)| a * b).sum::<f64>() / squares.max(1e-12)
         })
         .sum();
     variance * (1.0 + 2.0 * correlation).clamp(1.0, 20.0)
@@ -347,11 +295,7 @@ fn reduction(whitened: &[f64], rows: usize) -> f64 {
 /// Entries of one joint's numbers among `active`, that only inertia needs.
 pub fn inertial_entries(active: &[usize]) -> Vec<usize> {
     use super::layout::{CENTER, INERTIA, MASS};
-    active
-        .iter()
-        .copied()
-        .filter(|i| [INERTIA, MASS, CENTER, CENTER + 1].contains(i))
-        .collect()
+    active.iter().copied().filter(|i| [INERTIA, MASS, CENTER, CENTER + 1].contains(i)).collect()
 }
 
 /// ln F with a greater deviation than this is not known yet.

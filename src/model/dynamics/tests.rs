@@ -11,14 +11,12 @@ use super::innovations::WindowModel;
 use super::layout::{JointScales, Mechanism, SIZE, joint_models};
 use super::learner::{DynamicsInput, DynamicsLearner};
 use super::posterior::DynamicsPosterior;
-use crate::types::posterior::Quantity;
 use super::track::{TrackKinematics, TrackSource, joint_track};
 use crate::geometry::HullProperties;
 use crate::math::{Pose, Screw};
-use crate::mechanism::{
-    Body, JointParameters, JointType, State, Tree, WrenchSample, WrenchTrack, rollout,
-};
+use crate::mechanism::{Body, JointParameters, JointType, State, Tree, WrenchSample, WrenchTrack, rollout};
 use crate::model::{Axis, Contact, KinematicFit, KinematicJoint, WindowObservations};
+use crate::types::posterior::Quantity;
 use crate::types::{AppliedWrench, Label, Stamp};
 
 const GRAVITY: Vector3<f64> = Vector3::new(0.0, 0.0, -9.81);
@@ -52,13 +50,7 @@ fn joint(
 ) -> KinematicJoint {
     let (joint_type, axis) = match axis {
         Some((direction, point)) => (JointType::Revolute, Axis { direction, point }),
-        None => (
-            JointType::Prismatic,
-            Axis {
-                direction: slide,
-                point: Vector3::zeros(),
-            },
-        ),
+        None => (JointType::Prismatic, Axis { direction: slide, point: Vector3::zeros() }),
     };
     KinematicJoint {
         parent,
@@ -71,13 +63,7 @@ fn joint(
     }
 }
 
-fn body(
-    joint: &KinematicJoint,
-    mass: f64,
-    com: Vector3<f64>,
-    damping: f64,
-    friction: f64,
-) -> Body<f64> {
+fn body(joint: &KinematicJoint, mass: f64, com: Vector3<f64>, damping: f64, friction: f64) -> Body<f64> {
     Body {
         parent: joint.parent,
         joint: joint.joint_type,
@@ -91,55 +77,22 @@ fn body(
 
 impl Truth {
     fn single(revolute: bool, damping: f64, friction: f64, mass: f64) -> Self {
-        let joint = joint(
-            None,
-            1,
-            revolute.then(|| (Vector3::z(), Vector3::zeros())),
-            Vector3::x(),
-        );
+        let joint = joint(None, 1, revolute.then(|| (Vector3::z(), Vector3::zeros())), Vector3::x());
         let com = Vector3::new(0.2, 0.0, 0.0);
         let tree = Tree::new(vec![body(&joint, mass, com, damping, friction)], GRAVITY).unwrap();
         let hulls = BTreeMap::from([(Label(1), hull(com))]);
-        Self {
-            joints: vec![joint],
-            tree,
-            hulls,
-            touched: 0,
-            contact: Vector3::new(0.4, 0.0, 0.1),
-        }
+        Self { joints: vec![joint], tree, hulls, touched: 0, contact: Vector3::new(0.4, 0.0, 0.1) }
     }
 
     /// A flap on a turning post: gravity loads the second joint.
     fn chain() -> Self {
-        let first = joint(
-            None,
-            1,
-            Some((Vector3::z(), Vector3::zeros())),
-            Vector3::zeros(),
-        );
-        let second = joint(
-            Some(0),
-            2,
-            Some((Vector3::y(), Vector3::new(0.3, 0.0, 0.0))),
-            Vector3::zeros(),
-        );
+        let first = joint(None, 1, Some((Vector3::z(), Vector3::zeros())), Vector3::zeros());
+        let second = joint(Some(0), 2, Some((Vector3::y(), Vector3::new(0.3, 0.0, 0.0))), Vector3::zeros());
         let (com1, com2) = (Vector3::new(0.15, 0.0, 0.0), Vector3::new(0.5, 0.02, 0.0));
-        let bodies = vec![
-            body(&first, 3.0, com1, 0.4, 0.5),
-            body(&second, 1.0, com2, 0.15, 0.3),
-        ];
+        let bodies = vec![body(&first, 3.0, com1, 0.4, 0.5), body(&second, 1.0, com2, 0.15, 0.3)];
         let tree = Tree::new(bodies, GRAVITY).unwrap();
-        let hulls = BTreeMap::from([
-            (Label(1), hull(com1)),
-            (Label(2), hull(Vector3::new(0.49, 0.0, 0.0))),
-        ]);
-        Self {
-            joints: vec![first, second],
-            tree,
-            hulls,
-            touched: 1,
-            contact: Vector3::new(0.65, 0.1, 0.0),
-        }
+        let hulls = BTreeMap::from([(Label(1), hull(com1)), (Label(2), hull(Vector3::new(0.49, 0.0, 0.0)))]);
+        Self { joints: vec![first, second], tree, hulls, touched: 1, contact: Vector3::new(0.65, 0.1, 0.0) }
     }
 
     fn displacements(&self, q: &[f64]) -> Vec<Pose> {
@@ -170,8 +123,7 @@ impl Truth {
         let hold = self.contact_force(&vec![0.0; self.joints.len()]);
         for i in 0..(span_s / dt) as usize {
             let t = i as f64 * dt;
-            let at =
-                self.displacements(&state.positions)[self.touched].transform_point(&self.contact);
+            let at = self.displacements(&state.positions)[self.touched].transform_point(&self.contact);
             if i % 13 == 0 {
                 times_s.push(t);
                 positions.push(state.positions.clone());
@@ -200,29 +152,14 @@ impl Truth {
             };
             let samples = [sample(t, force), sample(t + dt, 2.0 * force - force_before)];
             force_before = force;
-            let run = rollout(
-                &self.tree,
-                &state,
-                &[WrenchTrack::new(self.touched, &samples)],
-                &[t, t + dt],
-                1e-3,
-            )
-            .unwrap();
+            let run =
+                rollout(&self.tree, &state, &[WrenchTrack::new(self.touched, &samples)], &[t, t + dt], 1e-3).unwrap();
             state = State::new(run.positions(1).to_vec(), run.rates(1).to_vec());
         }
-        let contact = Contact {
-            label: self.joints[self.touched].child,
-            track,
-        };
-        let window = WindowObservations {
-            times_s,
-            contacts: vec![contact.clone()],
-            wrenches,
-            ..WindowObservations::default()
-        };
-        let by_joint = (0..self.joints.len())
-            .map(|k| positions.iter().map(|q| q[k]).collect())
-            .collect();
+        let contact = Contact { label: self.joints[self.touched].child, track };
+        let window =
+            WindowObservations { times_s, contacts: vec![contact.clone()], wrenches, ..WindowObservations::default() };
+        let by_joint = (0..self.joints.len()).map(|k| positions.iter().map(|q| q[k]).collect()).collect();
         (window, contact, by_joint)
     }
 
@@ -236,11 +173,7 @@ impl Truth {
     }
 
     fn fit(&self, windows: &[Vec<Vec<f64>>]) -> KinematicFit {
-        let parameters: usize = self
-            .joints
-            .iter()
-            .map(KinematicJoint::axis_parameters)
-            .sum();
+        let parameters: usize = self.joints.iter().map(KinematicJoint::axis_parameters).sum();
         KinematicFit {
             joints: self.joints.clone(),
             positions: windows.to_vec(),
@@ -258,11 +191,7 @@ impl Truth {
         let mut windows = Vec::new();
         let mut positions = Vec::new();
         for i in 0..count {
-            let amplitude = if self.joints[0].joint_type == JointType::Prismatic {
-                0.2
-            } else {
-                0.7
-            };
+            let amplitude = if self.joints[0].joint_type == JointType::Prismatic { 0.2 } else { 0.7 };
             let (window, contact, q) = self.window(2.5, amplitude, 2.0 + 2.5 * (i % 2) as f64, rng);
             windows.push(window);
             positions.push(q);
@@ -292,15 +221,10 @@ fn single_joints_are_recovered() {
         let truth = Truth::single(revolute, damping, friction, 2.5);
         let found = &truth.learn(2, &mut ChaCha8Rng::seed_from_u64(3)).joints[0];
         let inertia = truth.tree.joint_inertia(0);
-        for (quantity, truth) in [
-            (&found.damping, damping),
-            (&found.friction, friction),
-            (&found.joint_inertia, inertia),
-        ] {
-            assert!(
-                (quantity.median / truth - 1.0).abs() < 0.05,
-                "{quantity:?}, truth {truth}"
-            );
+        for (quantity, truth) in
+            [(&found.damping, damping), (&found.friction, friction), (&found.joint_inertia, inertia)]
+        {
+            assert!((quantity.median / truth - 1.0).abs() < 0.05, "{quantity:?}, truth {truth}");
         }
     }
 }
@@ -312,15 +236,10 @@ fn a_chain_under_gravity_is_recovered() {
     for (k, (damping, friction)) in [(0.4, 0.5), (0.15, 0.3)].into_iter().enumerate() {
         let joint = &found.joints[k];
         let inertia = truth.tree.joint_inertia(k);
-        for (quantity, truth, within) in [
-            (&joint.damping, damping, 0.15),
-            (&joint.friction, friction, 0.1),
-            (&joint.joint_inertia, inertia, 0.1),
-        ] {
-            assert!(
-                (quantity.median / truth - 1.0).abs() < within,
-                "joint {k}: {quantity:?}, truth {truth}"
-            );
+        for (quantity, truth, within) in
+            [(&joint.damping, damping, 0.15), (&joint.friction, friction, 0.1), (&joint.joint_inertia, inertia, 0.1)]
+        {
+            assert!((quantity.median / truth - 1.0).abs() < within, "joint {k}: {quantity:?}, truth {truth}");
         }
     }
 }
@@ -330,8 +249,7 @@ fn ninety_percent_intervals_hold_the_truth() {
     let mut rng = ChaCha8Rng::seed_from_u64(11);
     let (mut held, mut total) = (0, 0);
     for i in 0..100 {
-        let mut log =
-            |low: f64, high: f64| (low.ln() + (high / low).ln() * rng.random::<f64>()).exp();
+        let mut log = |low: f64, high: f64| (low.ln() + (high / low).ln() * rng.random::<f64>()).exp();
         let revolute = i % 2 == 0;
         let (damping, friction, mass) = if revolute {
             (log(0.1, 1.0), log(0.1, 1.0), log(1.0, 6.0))
@@ -341,11 +259,9 @@ fn ninety_percent_intervals_hold_the_truth() {
         let truth = Truth::single(revolute, damping, friction, mass);
         let found = &truth.learn(1, &mut rng).joints[0];
         let inertia = truth.tree.joint_inertia(0);
-        for (quantity, truth) in [
-            (&found.damping, damping),
-            (&found.friction, friction),
-            (&found.joint_inertia, inertia),
-        ] {
+        for (quantity, truth) in
+            [(&found.damping, damping), (&found.friction, friction), (&found.joint_inertia, inertia)]
+        {
             held += usize::from(holds(quantity, truth));
             total += 1;
         }
@@ -362,13 +278,8 @@ fn replaying_windows_never_narrows() {
     let mut learner = DynamicsLearner::new(GRAVITY);
     let windows = [&window];
     let contacts = [contact];
-    let input = DynamicsInput {
-        windows: &windows,
-        contacts: &contacts,
-        zero: Stamp(0),
-        parts: &truth.hulls,
-        use_tool: true,
-    };
+    let input =
+        DynamicsInput { windows: &windows, contacts: &contacts, zero: Stamp(0), parts: &truth.hulls, use_tool: true };
     let fit = truth.fit(&[q]);
     learner.learn_window(&fit, &input);
     let once = learner.posterior().unwrap();
@@ -387,11 +298,7 @@ fn a_stuck_joint_bounds_friction_from_below() {
     let truth = Truth::single(true, 0.3, 50.0, 2.5);
     let mut rng = ChaCha8Rng::seed_from_u64(9);
     let (window, contact, q) = truth.window(2.0, 0.7, 3.0, &mut rng);
-    let load = window
-        .wrenches
-        .iter()
-        .map(|w| w.force_in_world.norm() * 0.4)
-        .fold(0.0, f64::max);
+    let load = window.wrenches.iter().map(|w| w.force_in_world.norm() * 0.4).fold(0.0, f64::max);
     let mut learner = DynamicsLearner::new(GRAVITY);
     let input = DynamicsInput {
         windows: &[&window],
@@ -402,10 +309,7 @@ fn a_stuck_joint_bounds_friction_from_below() {
     };
     assert_eq!(learner.learn_window(&truth.fit(&[q]), &input).failure, None);
     let friction = &learner.posterior().unwrap().joints[0].friction;
-    assert!(
-        friction.q05 > 0.4 * load && friction.q95 > 2.0 * load,
-        "{friction:?}, load {load}"
-    );
+    assert!(friction.q05 > 0.4 * load && friction.q95 > 2.0 * load, "{friction:?}, load {load}");
 }
 
 #[test]
@@ -415,10 +319,8 @@ fn innovations_have_their_gradient() {
         let (window, contact, q) = truth.window(1.5, 0.7, 3.0, &mut rng);
         let n = truth.joints.len();
         let moving: Vec<usize> = (0..n).collect();
-        let kinematics = TrackKinematics {
-            axes: truth.joints.iter().map(|j| j.axis).collect(),
-            tool_offset: Vector3::zeros(),
-        };
+        let kinematics =
+            TrackKinematics { axes: truth.joints.iter().map(|j| j.axis).collect(), tool_offset: Vector3::zeros() };
         let source = TrackSource {
             joints: &truth.joints,
             positions: &q,
@@ -430,45 +332,19 @@ fn innovations_have_their_gradient() {
             moving: &moving,
         };
         let track = joint_track(&source, &kinematics).unwrap();
-        let scales = vec![
-            JointScales {
-                force: 1.0,
-                rate: 0.5
-            };
-            n
-        ];
-        let models = joint_models(
-            &truth.joints,
-            |j| truth.hulls[&j.child].clone(),
-            &scales,
-            &vec![[false; 2]; n],
-            &GRAVITY,
-        );
-        let active: Vec<usize> = models
-            .iter()
-            .enumerate()
-            .flat_map(|(k, m)| m.active().into_iter().map(move |i| k * SIZE + i))
-            .collect();
+        let scales = vec![JointScales { force: 1.0, rate: 0.5 }; n];
+        let models =
+            joint_models(&truth.joints, |j| truth.hulls[&j.child].clone(), &scales, &vec![[false; 2]; n], &GRAVITY);
+        let active: Vec<usize> =
+            models.iter().enumerate().flat_map(|(k, m)| m.active().into_iter().map(move |i| k * SIZE + i)).collect();
         let mut x: Vec<f64> = models
             .iter()
-            .flat_map(|m| {
-                m.prior([0.0; 2])
-                    .unwrap()
-                    .moments()
-                    .unwrap()
-                    .0
-                    .iter()
-                    .copied()
-                    .collect::<Vec<_>>()
-            })
+            .flat_map(|m| m.prior([0.0; 2]).unwrap().moments().unwrap().0.iter().copied().collect::<Vec<_>>())
             .collect();
         for k in 0..n {
             x[k * SIZE + 1] = -1.2;
         }
-        let mechanism = Mechanism {
-            joints: models,
-            gravity: GRAVITY,
-        };
+        let mechanism = Mechanism { joints: models, gravity: GRAVITY };
         let frozen = vec![None; n];
         let model = WindowModel {
             mechanism: &mechanism,
@@ -488,21 +364,12 @@ fn innovations_have_their_gradient() {
                 model.residuals(&moved, &here.gains).unwrap()
             };
             let (plus, minus) = (side(1e-5), side(-1e-5));
-            let numeric: Vec<f64> = plus
-                .iter()
-                .zip(&minus)
-                .map(|(a, b)| (a - b) / 2e-5)
-                .collect();
+            let numeric: Vec<f64> = plus.iter().zip(&minus).map(|(a, b)| (a - b) / 2e-5).collect();
             let size = numeric.iter().map(|s| s.abs()).fold(1e-3, f64::max);
             // Switches between stick and slip fall on a few observations.
-            let wrong = (0..numeric.len())
-                .filter(|&k| (numeric[k] - here.slopes[k * p + i]).abs() > 2e-3 * size)
-                .count();
-            assert!(
-                wrong * 20 <= numeric.len(),
-                "parameter {at}: {wrong} of {}",
-                numeric.len()
-            );
+            let wrong =
+                (0..numeric.len()).filter(|&k| (numeric[k] - here.slopes[k * p + i]).abs() > 2e-3 * size).count();
+            assert!(wrong * 20 <= numeric.len(), "parameter {at}: {wrong} of {}", numeric.len());
         }
     }
 }

@@ -87,15 +87,7 @@ impl TrackSource<'_> {
         let mut all: Vec<Pose> = Vec::with_capacity(self.joints.len());
         for (k, joint) in self.joints.iter().enumerate() {
             let parent = joint.parent.map_or_else(Pose::identity, |p| all[p]);
-            all.push(
-                parent
-                    * KinematicJoint {
-                        axis: axes[k],
-                        ..*joint
-                    }
-                    .screw()
-                    .displacement(q[k]),
-            );
+            all.push(parent * KinematicJoint { axis: axes[k], ..*joint }.screw().displacement(q[k]));
         }
         all
     }
@@ -107,17 +99,8 @@ impl TrackSource<'_> {
         while let Some(k) = at {
             let joint = &self.joints[k];
             if let Some(column) = self.moving.iter().position(|&m| m == k) {
-                let parent = joint
-                    .parent
-                    .map_or_else(Pose::identity, |p| displacements[p]);
-                twists[column] = parent.adjoint(
-                    &KinematicJoint {
-                        axis: axes[k],
-                        ..*joint
-                    }
-                    .screw()
-                    .0,
-                );
+                let parent = joint.parent.map_or_else(Pose::identity, |p| displacements[p]);
+                twists[column] = parent.adjoint(&KinematicJoint { axis: axes[k], ..*joint }.screw().0);
             }
             at = joint.parent;
         }
@@ -127,31 +110,21 @@ impl TrackSource<'_> {
     /// Positions of all joints at a time, between the frames.
     fn positions_at(&self, time_s: f64) -> Vec<f64> {
         let times = &self.window.times_s;
-        let after = times
-            .partition_point(|&t| t < time_s)
-            .clamp(1, times.len() - 1);
+        let after = times.partition_point(|&t| t < time_s).clamp(1, times.len() - 1);
         let (t0, t1) = (times[after - 1], times[after]);
         let weight = ((time_s - t0) / (t1 - t0)).clamp(0.0, 1.0);
-        self.positions
-            .iter()
-            .map(|p| p[after - 1] + weight * (p[after] - p[after - 1]))
-            .collect()
+        self.positions.iter().map(|p| p[after - 1] + weight * (p[after] - p[after - 1])).collect()
     }
 
     fn contact(&self) -> Option<(usize, &Contact, Option<Vector3<f64>>)> {
-        let (index, contact) = self
-            .contacts
-            .iter()
-            .enumerate()
-            .find(|(_, c)| !c.track.is_empty())?;
+        let (index, contact) = self.contacts.iter().enumerate().find(|(_, c)| !c.track.is_empty())?;
         let joint = self.joints.iter().position(|j| j.child == contact.label)?;
         Some((joint, contact, self.contact_points.get(index).copied()))
     }
 
     fn contact_span(&self, contact: &Contact) -> Option<(f64, f64)> {
-        let time = |t: Option<&(usize, Vector3<f64>, f64)>| {
-            t.and_then(|(k, _, _)| self.window.times_s.get(*k)).copied()
-        };
+        let time =
+            |t: Option<&(usize, Vector3<f64>, f64)>| t.and_then(|(k, _, _)| self.window.times_s.get(*k)).copied();
         Some((time(contact.track.first())?, time(contact.track.last())?))
     }
 }
@@ -165,15 +138,10 @@ pub fn joint_track(source: &TrackSource<'_>, kinematics: &TrackKinematics) -> Op
     }
     let (begin_s, end_s) = (times[0], times[times.len() - 1]);
     let seconds = |w: &crate::types::AppliedWrench| w.stamp.seconds_since(source.zero);
-    let readings: Vec<_> = source
-        .window
-        .wrenches
-        .iter()
-        .filter(|w| (begin_s - 0.1..=end_s + 0.1).contains(&seconds(w)))
-        .collect();
-    let touching = source
-        .contact()
-        .and_then(|(joint, contact, point)| Some((joint, source.contact_span(contact)?, point)));
+    let readings: Vec<_> =
+        source.window.wrenches.iter().filter(|w| (begin_s - 0.1..=end_s + 0.1).contains(&seconds(w))).collect();
+    let touching =
+        source.contact().and_then(|(joint, contact, point)| Some((joint, source.contact_span(contact)?, point)));
     let samples: Vec<WrenchSample> = touching.map_or_else(Vec::new, |(_, (from_s, to_s), _)| {
         readings
             .iter()
@@ -200,21 +168,12 @@ pub fn joint_track(source: &TrackSource<'_>, kinematics: &TrackKinematics) -> Op
     let mut positions = Vec::with_capacity(located.len());
     for (time_s, located) in located {
         if let Some((rows, value)) = located.whitened() {
-            observations.push(Observation {
-                time_s,
-                rows,
-                value,
-            });
+            observations.push(Observation { time_s, rows, value });
             positions.push(located.position);
         }
     }
-    let forces: Vec<(f64, Vector3<f64>)> = samples
-        .iter()
-        .map(|s| (s.stamp_s, s.force_in_world))
-        .collect();
-    let span_s = samples
-        .last()
-        .map_or(0.0, |l| l.stamp_s - samples[0].stamp_s);
+    let forces: Vec<(f64, Vector3<f64>)> = samples.iter().map(|s| (s.stamp_s, s.force_in_world)).collect();
+    let span_s = samples.last().map_or(0.0, |l| l.stamp_s - samples[0].stamp_s);
     Some(JointTrack {
         observations,
         positions,
@@ -263,10 +222,7 @@ fn run_variance(run: &[(f64, Vector3<f64>)]) -> Option<f64> {
         right += row(*t) * x.transpose();
     }
     let solution = matrix.try_inverse()? * right;
-    let squares: f64 = run
-        .iter()
-        .map(|(t, x)| (solution.transpose() * row(*t) - x).norm_squared())
-        .sum();
+    let squares: f64 = run.iter().map(|(t, x)| (solution.transpose() * row(*t) - x).norm_squared()).sum();
     Some(squares / (3.0 * (run.len() as f64 - 3.0)))
 }
 
@@ -312,31 +268,18 @@ fn tool_information(
             if i > start {
                 let run = &tool[start..i];
                 let time_s = run.iter().map(|(t, _)| t).sum::<f64>() / count;
-                bins.push((
-                    time_s,
-                    run.iter().map(|(_, x)| x).sum::<Vector3<f64>>() / count,
-                    count,
-                ));
+                bins.push((time_s, run.iter().map(|(_, x)| x).sum::<Vector3<f64>>() / count, count));
             }
             start = i;
         }
     }
     let deviation = local_deviation(tool).max(LEAST_TOOL_DEVIATION);
-    let mut positions: Vec<Vec<f64>> = bins
-        .iter()
-        .map(|(t, _, _)| source.positions_at(*t))
-        .collect();
+    let mut positions: Vec<Vec<f64>> = bins.iter().map(|(t, _, _)| source.positions_at(*t)).collect();
     let carried = |q: &[f64], x: &Vector3<f64>| {
-        source.displacements(&kinematics.axes, q)[touched]
-            .inverse()
-            .transform_point(&(x - kinematics.tool_offset))
+        source.displacements(&kinematics.axes, q)[touched].inverse().transform_point(&(x - kinematics.tool_offset))
     };
     let mean_point = |positions: &[Vec<f64>]| {
-        let sum: Vector3<f64> = bins
-            .iter()
-            .zip(positions)
-            .map(|((_, x, _), q)| carried(q, x))
-            .sum();
+        let sum: Vector3<f64> = bins.iter().zip(positions).map(|((_, x, _), q)| carried(q, x)).sum();
         sum / bins.len().max(1) as f64
     };
     let mut point = point.unwrap_or_else(|| mean_point(&positions));
@@ -354,31 +297,20 @@ fn tool_information(
             let columns: Vec<Vector3<f64>> = source
                 .twists(&kinematics.axes, &displacements, touched)
                 .iter()
-                .map(|v| {
-                    Vector3::new(v[0], v[1], v[2]).cross(&moved) + Vector3::new(v[3], v[4], v[5])
-                })
+                .map(|v| Vector3::new(v[0], v[1], v[2]).cross(&moved) + Vector3::new(v[3], v[4], v[5]))
                 .collect();
             let information = DMatrix::from_fn(n, n, |i, j| columns[i].dot(&columns[j]) / variance);
             let slope = DVector::from_fn(n, |i, _| columns[i].dot(&residual) / variance);
             let position = DVector::from_fn(n, |i, _| q[source.moving[i]]);
             let regular = &information + &anchor * information.diagonal().max();
-            let step = regular
-                .cholesky()
-                .map_or_else(|| DVector::zeros(n), |c| c.solve(&slope));
+            let step = regular.cholesky().map_or_else(|| DVector::zeros(n), |c| c.solve(&slope));
             let weighted = &information * &position + &slope;
             for (i, &joint) in source.moving.iter().enumerate() {
                 q[joint] += step[i].clamp(-0.2, 0.2);
             }
             if round == 3 {
                 let position = DVector::from_fn(n, |i, _| q[source.moving[i]]);
-                result.push((
-                    *time_s,
-                    Located {
-                        information,
-                        weighted,
-                        position,
-                    },
-                ));
+                result.push((*time_s, Located { information, weighted, position }));
             }
         }
         point = mean_point(&positions);
@@ -387,10 +319,7 @@ fn tool_information(
 }
 
 /// Part poses as information about the moving joints, at every frame.
-fn frame_information(
-    source: &TrackSource<'_>,
-    kinematics: &TrackKinematics,
-) -> Vec<(f64, Located)> {
+fn frame_information(source: &TrackSource<'_>, kinematics: &TrackKinematics) -> Vec<(f64, Located)> {
     let n = source.moving.len();
     let frames = source.window.times_s.len();
     let all: Vec<Vec<Pose>> = (0..frames)
@@ -407,11 +336,7 @@ fn frame_information(
                 position: DVector::from_fn(n, |i, _| source.positions[source.moving[i]][k]),
             };
             for (j, joint) in source.joints.iter().enumerate() {
-                let Some(measured) = source
-                    .window
-                    .poses
-                    .get(&joint.child)
-                    .and_then(|p| p.get(k).copied().flatten())
+                let Some(measured) = source.window.poses.get(&joint.child).and_then(|p| p.get(k).copied().flatten())
                 else {
                     continue;
                 };
@@ -420,26 +345,20 @@ fn frame_information(
                     continue;
                 }
                 let here = place(joint, &all[k][j]);
-                let sharing = all
-                    .iter()
-                    .filter(|d| (place(joint, &d[j]) - here).norm() < SHARED_DISTANCE)
-                    .count();
+                let sharing = all.iter().filter(|d| (place(joint, &d[j]) - here).norm() < SHARED_DISTANCE).count();
                 let information = shared(&measured.information, joint.radius, sharing as f64);
                 let residual = (Pose::from_translation(-joint.center)
                     * measured.displacement.inverse()
                     * all[k][j]
                     * Pose::from_translation(joint.center))
                 .log();
-                let weight = (STUDENT_FREEDOM + 6.0)
-                    / (STUDENT_FREEDOM + residual.dot(&(information * residual)));
-                let into_body =
-                    (Pose::from_translation(-joint.center) * all[k][j].inverse()).adjoint_matrix();
+                let weight = (STUDENT_FREEDOM + 6.0) / (STUDENT_FREEDOM + residual.dot(&(information * residual)));
+                let into_body = (Pose::from_translation(-joint.center) * all[k][j].inverse()).adjoint_matrix();
                 let columns: Vec<Vector6<f64>> = twists.iter().map(|t| into_body * t).collect();
                 for a in 0..n {
                     located.weighted[a] -= weight * columns[a].dot(&(information * residual));
                     for b in 0..n {
-                        located.information[(a, b)] +=
-                            weight * columns[a].dot(&(information * columns[b]));
+                        located.information[(a, b)] += weight * columns[a].dot(&(information * columns[b]));
                     }
                 }
             }
@@ -462,21 +381,12 @@ fn shared(raw: &Matrix6<f64>, radius: f64, sharing: f64) -> Matrix6<f64> {
     let scaled = Matrix6::from_fn(|i, j| raw[(i, j)] / (scale[i] * scale[j]));
     let mut eigen = scaled.symmetric_eigen();
     let floor = sharing * SHARED_ERROR * SHARED_ERROR;
-    eigen.eigenvalues.apply(|x| {
-        *x = if *x > 0.0 {
-            1.0 / (1.0 / *x + floor)
-        } else {
-            0.0
-        }
-    });
+    eigen.eigenvalues.apply(|x| *x = if *x > 0.0 { 1.0 / (1.0 / *x + floor) } else { 0.0 });
     let clean = eigen.recompose();
     Matrix6::from_fn(|i, j| clean[(i, j)] * scale[i] * scale[j])
 }
 
 /// The touched label of a window's contacts, if any.
 pub fn touched_label(contacts: &[Contact]) -> Option<Label> {
-    contacts
-        .iter()
-        .find(|c| !c.track.is_empty())
-        .map(|c| c.label)
+    contacts.iter().find(|c| !c.track.is_empty()).map(|c| c.label)
 }
