@@ -8,6 +8,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{Matrix6, Vector3, Vector6};
+use rayon::prelude::*;
 
 use crate::math::{Pose, Screw};
 use crate::mechanism::JointType;
@@ -100,8 +101,9 @@ pub fn explain_window(scene: &Scene<'_>) -> BTreeMap<Label, Motion> {
     }
     while !open.is_empty() {
         let mut best: Option<(f64, usize, Motion)> = None;
-        for (index, &label) in open.iter().enumerate() {
-            let Some(motion) = scene.best_motion(label, &motions) else { continue };
+        let offers: Vec<Option<Motion>> = open.par_iter().map(|&label| scene.best_motion(label, &motions)).collect();
+        for (index, (&label, offer)) in open.iter().zip(offers).enumerate() {
+            let Some(motion) = offer else { continue };
             let score =
                 motion.excess + 0.05 * (scene.tool_miss(label, &motion.displacements) / TOOL_EXPLAINED).min(20.0);
             if best.as_ref().is_none_or(|(other, _, _)| score < *other) {

@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{DMatrix, Vector3};
+use rayon::prelude::*;
 
 use super::explain::{Baseline, Frame, Motion, Scene, explain_window, measure_faces, travel};
 use crate::geometry::{HullProperties, hull_properties};
@@ -252,38 +253,44 @@ impl Learner {
     /// Evidence for every parent and type of every part that moved.
     fn weigh_edges(&mut self, motions: &BTreeMap<Label, Motion>) {
         let movers: Vec<Label> = self.tracks.keys().copied().filter(|&label| self.ever_moved(label)).collect();
-        let windows: Vec<&WindowObservations> = self.windows.iter().collect();
-        let mut evidence = BTreeMap::new();
+        let mut edges: Vec<(Label, Option<Label>)> = Vec::new();
         for &child in &movers {
-            let part = self.part(child);
-            let mut parents: Vec<Option<Label>> = vec![None];
-            parents.extend(movers.iter().filter(|l| **l != child).map(|l| Some(*l)));
-            let mut options = Vec::new();
-            for parent in parents {
-                if let Some(old) = self.unaffected(child, parent, motions) {
-                    options.push(old);
-                    continue;
-                }
-                let track = parent.map(|p| self.tracks[&p].as_slice());
-                let relative = relative_windows(child, track, &windows);
-                let resting = self.resting_windows(child, parent);
-                let rigid = rigid_evidence(&part, &relative, &self.settings);
-                let mut option = ParentEvidence { parent, log_evidence: [rigid; 3], fits: [None, None, None] };
-                for joint_type in [JointType::Prismatic, JointType::Revolute] {
-                    let starts = self.start_axes(&part, parent, joint_type, &relative, motions);
-                    let fit = moving_evidence(&part, joint_type, &starts, &relative, &resting, &self.settings);
-                    let slot = joint_type as usize;
-                    if let Some(fit) = fit {
-                        option.log_evidence[slot] = option.log_evidence[slot].max(fit.log_evidence);
-                        option.fits[slot] = Some(fit);
-                    }
-                }
-                tracing::debug!(%child, parent = ?option.parent, evidence = ?option.log_evidence, "edge");
-                options.push(option);
-            }
-            evidence.insert(child, options);
+            edges.push((child, None));
+            edges.extend(movers.iter().filter(|l| **l != child).map(|l| (child, Some(*l))));
+        }
+        // Collected in the order of `edges`, so threads do not show in the result.
+        let options: Vec<ParentEvidence> = edges
+            .par_iter()
+            .map(|&(child, parent)| {
+                self.unaffected(child, parent, motions).unwrap_or_else(|| self.weigh_edge(child, parent, motions))
+            })
+            .collect();
+        let mut evidence: BTreeMap<Label, Vec<ParentEvidence>> = BTreeMap::new();
+        for ((child, _), option) in edges.into_iter().zip(options) {
+            tracing::debug!(%child, parent = ?option.parent, evidence = ?option.log_evidence, "edge");
+            evidence.entry(child).or_default().push(option);
         }
         self.evidence = evidence;
+    }
+
+    fn weigh_edge(&self, child: Label, parent: Option<Label>, motions: &BTreeMap<Label, Motion>) -> ParentEvidence {
+        let windows: Vec<&WindowObservations> = self.windows.iter().collect();
+        let part = self.part(child);
+        let track = parent.map(|p| self.tracks[&p].as_slice());
+        let relative = relative_windows(child, track, &windows);
+        let resting = self.resting_windows(child, parent);
+        let rigid = rigid_evidence(&part, &relative, &self.settings);
+        let mut option = ParentEvidence { parent, log_evidence: [rigid; 3], fits: [None, None, None] };
+        for joint_type in [JointType::Prismatic, JointType::Revolute] {
+            let starts = self.start_axes(&part, parent, joint_type, &relative, motions);
+            let fit = moving_evidence(&part, joint_type, &starts, &relative, &resting, &self.settings);
+            let slot = joint_type as usize;
+            if let Some(fit) = fit {
+                option.log_evidence[slot] = option.log_evidence[slot].max(fit.log_evidence);
+                option.fits[slot] = Some(fit);
+            }
+        }
+        option
     }
 
     /// The windows in which a part keeps its place on a parent, by their tracks.
@@ -514,16 +521,19 @@ impl Learner {
 
     /// Models of the moving parts, from the first look and the keyframes where the fit has them now.
     fn rebuild_models(&mut self) {
-        for (label, keyframes) in &self.keyframes {
-            let mut later = SurfelAccumulator::default();
-            for (window, frame, scan) in keyframes {
-                later.add(scan, &self.tracks[label][*window][*frame]);
-            }
-            let reference = self.reference.get(label).map_or(&[][..], Vec::as_slice);
-            if let Some(model) = PartModel::new(reference, &later.surfels()) {
-                self.models.insert(*label, model);
-            }
-        }
+        let rebuilt: Vec<(Label, Option<PartModel>)> = self
+            .keyframes
+            .par_iter()
+            .map(|(label, keyframes)| {
+                let mut later = SurfelAccumulator::default();
+                for (window, frame, scan) in keyframes {
+                    later.add(scan, &self.tracks[label][*window][*frame]);
+                }
+                let reference = self.reference.get(label).map_or(&[][..], Vec::as_slice);
+                (*label, PartModel::new(reference, &later.surfels()))
+            })
+            .collect();
+        self.models.extend(rebuilt.into_iter().filter_map(|(label, model)| Some((label, model?))));
     }
 }
 
