@@ -173,6 +173,14 @@ impl Pipeline {
         let seen = self.forecaster.is_some().then(|| frame.clone());
         if !self.cutter.as_ref().is_some_and(WindowCutter::is_open) && self.learner.is_none() {
             self.reference.push(frame.clone());
+            // A long look at an object at rest is thinned out, not kept.
+            if self.reference.len() > 4 * REFERENCE_FRAMES {
+                let mut index = 0;
+                self.reference.retain(|_| {
+                    index += 1;
+                    index % 2 == 0
+                });
+            }
         }
         let job = self.cutter.as_mut().and_then(|c| c.push_frame(frame, moving, nearest_label));
         if self.learner.is_none() && self.cutter.as_ref().is_some_and(WindowCutter::is_open) {

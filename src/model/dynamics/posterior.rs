@@ -46,7 +46,7 @@ pub struct DynamicsPosterior {
     pub joints: Vec<JointDynamics>,
     /// Of every joint's child.
     pub parts: Vec<PartDynamics>,
-    /// Mean of all joints' numbers ([`super::layout`]), one joint after the other.
+    /// Mean of all joints' numbers (laid out as in `layout`), one joint after the other.
     pub mean: DVector<f64>,
     /// Their covariance.
     pub covariance: DMatrix<f64>,
