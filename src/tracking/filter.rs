@@ -28,7 +28,7 @@ const SHARED_ERROR: f64 = 0.004;
 const GATE: f64 = 30.0;
 /// Innovations this much larger than expected, on the mean of the last so many, raise the process noise.
 const SURPRISED: f64 = 1.5;
-const SURPRISE_SHARE: f64 = 0.1;
+const SURPRISE_SHARE: f64 = 0.2;
 const MOST_UNEASE: f64 = 3000.0;
 /// An innovation beyond the gate is the joints' if their motion explains all but this \[m\] ...
 const EXPLAINED: f64 = 0.005;
@@ -339,7 +339,7 @@ impl Filter {
         }
         self.surprise += SURPRISE_SHARE * ((squared / 3.0).min(GATE) - self.surprise);
         self.unease = if self.surprise > SURPRISED {
-            (self.unease * 1.25).min(MOST_UNEASE)
+            (self.unease * 1.5).min(MOST_UNEASE)
         } else {
             (self.unease * 0.97).max(1.0)
         };
