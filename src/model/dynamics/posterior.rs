@@ -9,6 +9,11 @@ use crate::mechanism::{JointType, Tree};
 use crate::types::Label;
 use crate::types::posterior::{InformedBy, Quantity};
 
+/// Relative error that a model of rigid parts, one viscous and one Coulomb term keeps however long it
+/// is watched: on the generator's well-excited doors inertias were off by .7 % to 1.2 % with stated
+/// spreads a third of that.
+const MODEL_FLOOR: f64 = 0.012;
+
 /// Of one joint.
 #[derive(Clone, Debug, PartialEq)]
 pub struct JointDynamics {
@@ -69,6 +74,7 @@ impl DynamicsLearner {
         for (k, model) in models.iter().enumerate() {
             let at = self.mechanism.offset(k);
             let deviation = |entry: usize| posterior.covariance[(at + entry, at + entry)].max(0.0).sqrt();
+            let log_deviation = |entry: usize| deviation(entry).hypot(MODEL_FLOOR);
             let informed = |entry: usize, deviation: f64| match prior_deviation(k, entry) {
                 Some(prior) if deviation < 0.7 * prior => InformedBy::Dynamics,
                 _ => InformedBy::Prior,
@@ -79,7 +85,7 @@ impl DynamicsLearner {
                 Quantity::from_log_normal(
                     unit,
                     posterior.mean[at + entry],
-                    deviation(entry),
+                    log_deviation(entry),
                     informed(entry, deviation(entry)),
                 )
             };
@@ -96,7 +102,7 @@ impl DynamicsLearner {
                 joint_inertia: Quantity::from_log_normal(
                     units[2],
                     inertia,
-                    inertia_deviation,
+                    inertia_deviation.hypot(MODEL_FLOOR),
                     informed(INERTIA, inertia_deviation),
                 ),
                 lower_limit: stop(0, LOWER),
