@@ -130,7 +130,13 @@ proptest! {
         let energy = |s: &State<f64>| {
             kinetic_energy(&tree, &s.positions, &s.rates) + tree.potential_energy(&s.positions)
         };
-        let drift = |step_s: f64| (energy(&simulate(&tree, &start, 0.5, step_s)) - energy(&start)).abs();
+        // The largest along the way: at one instant terms of different order may cancel.
+        let drift = |step_s: f64| {
+            [0.1, 0.2, 0.3, 0.4, 0.5]
+                .map(|seconds| (energy(&simulate(&tree, &start, seconds, step_s)) - energy(&start)).abs())
+                .into_iter()
+                .fold(0.0, f64::max)
+        };
         let scale = 1.0 + kinetic_energy(&tree, &start.positions, &start.rates);
         prop_assert!(drift(1e-3) < 2e-3 * scale, "{} of {scale}", drift(1e-3));
         prop_assert!(drift(2.5e-4) < 0.12 * drift(1e-3) + 1e-7 * scale);
