@@ -103,13 +103,6 @@ impl Pose<f64> {
         UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(self.rotation))
     }
 
-    /// The same transform with R projected back onto the rotations (after many products).
-    pub fn renormalized(&self) -> Self {
-        let rotation =
-            Rotation3::from_matrix_eps(&self.rotation, 1e-12, 20, Rotation3::from_matrix_unchecked(self.rotation));
-        Self { rotation: rotation.into_inner(), translation: self.translation }
-    }
-
     /// Ad(self) as a 6×6 matrix on (angular, linear) twists.
     pub fn adjoint_matrix(&self) -> Matrix6<f64> {
         let mut matrix = Matrix6::zeros();

@@ -289,9 +289,4 @@ impl PartModel {
         }
         faces.into_iter().filter(|(_, count)| *count >= FACE_SURFELS).map(|(normal, _)| normal).collect()
     }
-
-    /// Distance from a point at the reference configuration to the nearest surfel \[m\].
-    pub fn distance(&self, point: &Vector3<f64>) -> f64 {
-        self.surfels.iter().map(|s| (s.point - point).norm()).fold(f64::INFINITY, f64::min)
-    }
 }
