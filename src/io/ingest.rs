@@ -61,6 +61,11 @@ impl Ingest {
         }
     }
 
+    /// Nothing read yet, by another configuration, but for the transforms that are known.
+    pub fn anew(&self, config: &InputConfig) -> Self {
+        Self { transforms: self.transforms.clone(), ..Self::new(config) }
+    }
+
     /// What was counted so far.
     pub fn counters(&self) -> &Counters {
         &self.counters

@@ -7,11 +7,12 @@ use std::net::{IpAddr, Ipv4Addr};
 
 use anyhow::{Context as _, bail};
 use ros2_client::{
-    Context, MessageTypeName, NameError, Name, Node, NodeName, NodeOptions, Publisher, Server, ServiceMapping,
+    Context, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher, Server, ServiceMapping,
     ServiceTypeName, Subscription,
     ros2::{Duration, QosPolicies, QosPolicyBuilder, QosProfile, policy},
 };
 use rustdds::{DomainParticipant, DomainParticipantBuilder, Topic, TopicKind};
+use ros2_interfaces_jazzy_serde::rcl_interfaces::msg::Log;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use super::names::Names;
@@ -97,7 +98,7 @@ impl Participant {
 
     fn topic(&self, name: &str, type_name: &str, quality: Quality) -> anyhow::Result<Topic> {
         let (package, message) = type_name.split_once("/msg/").unwrap_or(("", type_name));
-        Name::parse(name).map_err(|error: NameError| anyhow::anyhow!("topic `{name}`: {error}"))?;
+        Name::parse(name).map_err(|error| anyhow::anyhow!("topic `{name}`: {error}"))?;
         self.domain_participant()
             .create_topic(
                 format!("rt{name}"),
@@ -140,7 +141,7 @@ impl Participant {
     ///
     /// # Errors
     /// DDS.
-    pub fn advertise_rosout(&mut self) -> anyhow::Result<Publisher<ros2_client::Log>> {
+    pub fn advertise_rosout(&mut self) -> anyhow::Result<Publisher<Log>> {
         let topic = self.context.get_rosout_topic();
         self.node.create_publisher(&topic, None).context("advertising /rosout")
     }
