@@ -50,6 +50,14 @@ pub struct WindowJob {
     pub zero: crate::types::Stamp,
 }
 
+impl WindowJob {
+    /// Seconds since time zero of its first and last frame.
+    pub fn span_s(&self) -> (f64, f64) {
+        let time = |frame: Option<&Frame>| frame.map_or(0.0, |frame| frame.time_s);
+        (time(self.frames.first()), time(self.frames.last()))
+    }
+}
+
 /// Evidence for one parent of a part.
 #[derive(Clone, Debug)]
 pub struct ParentEvidence {
@@ -62,6 +70,7 @@ pub struct ParentEvidence {
 }
 
 /// Kinematic state of everything learned.
+#[derive(Clone)]
 pub struct Learner {
     /// The part fixed to the world.
     pub root: Label,
