@@ -1,6 +1,7 @@
 //! Subcommands, their options, logging.
 
 mod progress;
+mod recording;
 mod replay;
 
 use std::io::{self, Write};

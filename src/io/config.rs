@@ -133,6 +133,7 @@ impl Config {
             ("kinematics.shared_distance", self.kinematics.shared_distance),
             ("kinematics.rest_deviations", self.kinematics.rest_deviations),
             ("kinematics.student_freedom", self.kinematics.student_freedom),
+            ("windows.kept", self.windows.kept as f64),
             ("kinematics.steps", self.kinematics.steps as f64),
         ];
         positive.into_iter().try_for_each(|(key, value)| positive_number(key, value))?;

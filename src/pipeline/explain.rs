@@ -8,6 +8,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{Matrix6, Vector3, Vector6};
+use serde::{Deserialize, Serialize};
 use rayon::prelude::*;
 
 use crate::math::{Pose, Screw};
@@ -44,7 +45,7 @@ pub struct Frame {
 }
 
 /// What a part's scans cost where its pose is known.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct Baseline {
     /// Mean truncated cost per point.
     pub cost: f64,
@@ -68,8 +69,8 @@ pub struct Scene<'a> {
     pub joints: &'a [KinematicJoint],
     /// Parts that the tool has moved before: their joints are known from their own motion.
     pub touched_before: &'a BTreeSet<Label>,
-    /// The part that is fixed to the world.
-    pub root: Label,
+    /// The part that is fixed to the world, if that is known.
+    pub root: Option<Label>,
     /// Whether the tool's position is used as an observation.
     pub use_tool: bool,
 }
@@ -91,7 +92,7 @@ pub struct Motion {
 pub fn explain_window(scene: &Scene<'_>) -> BTreeMap<Label, Motion> {
     let mut motions: BTreeMap<Label, Motion> = BTreeMap::new();
     let mut open: Vec<Label> = Vec::new();
-    for &label in scene.models.keys().filter(|&&label| label != scene.root) {
+    for &label in scene.models.keys().filter(|&&label| Some(label) != scene.root) {
         let still = scene.evaluate(label, |_| scene.start_of(label));
         if still.excess < EXPLAINED && scene.tool_miss(label, &still.displacements) < TOOL_EXPLAINED {
             motions.insert(label, still);
@@ -246,7 +247,7 @@ impl Scene<'_> {
     fn parent_track(&self, parent: Option<Label>, known: &BTreeMap<Label, Motion>) -> Option<Vec<Pose>> {
         match parent {
             None => Some(vec![Pose::identity(); self.frames.len()]),
-            Some(label) if label == self.root => Some(vec![Pose::identity(); self.frames.len()]),
+            Some(label) if Some(label) == self.root => Some(vec![Pose::identity(); self.frames.len()]),
             Some(label) => known.get(&label).map(|motion| motion.displacements.clone()),
         }
     }
@@ -277,14 +278,7 @@ impl Scene<'_> {
         contact_point: Option<&Vector3<f64>>,
     ) -> JointPath {
         let model = &self.models[&label];
-        let grid = match joint_type {
-            JointType::Prismatic => (-0.6, 0.6, 0.010),
-            _ => {
-                let reach = axis_distance(screw, &model.centroid) + model.radius;
-                let step = (0.012 / reach).clamp(0.02, 0.08);
-                (-2.2, 2.2, step)
-            }
-        };
+        let grid = grid_of(model, screw, joint_type);
         search_path(model, &self.joint_frames(label, parents), screw, grid, contact_point)
     }
 
@@ -451,6 +445,18 @@ pub fn measurement_of(model: &PartModel, factor: &Quadratic, predicted: &Pose) -
         * Pose::exp(&step)
         * Pose::from_translation(-model.centroid);
     PoseMeasurement { displacement, information }
+}
+
+/// Positions of a joint to look at: least, greatest, step.
+pub fn grid_of(model: &PartModel, screw: &Screw, joint_type: JointType) -> (f64, f64, f64) {
+    match joint_type {
+        JointType::Prismatic => (-0.6, 0.6, 0.010),
+        _ => {
+            let reach = axis_distance(screw, &model.centroid) + model.radius;
+            let step = (0.012 / reach).clamp(0.02, 0.08);
+            (-2.2, 2.2, step)
+        }
+    }
 }
 
 fn seed_type(seed: &AxisSeed) -> JointType {

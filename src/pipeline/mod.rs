@@ -2,8 +2,11 @@
 
 mod explain;
 mod forecast;
+mod keyframes;
 mod learner;
 mod posterior;
+mod retention;
+mod saved;
 mod windows;
 mod working_frame;
 
@@ -13,6 +16,7 @@ use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
 pub use explain::Frame;
 pub use learner::{Learner, ParentEvidence, WindowJob};
+pub use saved::{ResumeError, SavedObject, SavedObjectRef};
 pub use windows::{FrameAssembler, WindowCutter, WindowSettings};
 
 use crate::math::Pose;
@@ -21,6 +25,7 @@ use crate::registration::{AlignmentSettings, Quadratic, SurfelAccumulator, align
 use crate::types::{Input, Label, Stamp};
 use explain::{FEWEST_POINTS, measurement_of, travel};
 use forecast::Forecaster;
+use saved::Resumed;
 use windows::frame_of;
 use working_frame::WorkingFrame;
 
@@ -74,6 +79,15 @@ pub enum Output {
         /// Covariance of its centre of mass, held fixed in the part \[m²\].
         covariance_m2: Matrix3<f64>,
     },
+    /// A saved object was taken up at the stream's first frame.
+    Resumed {
+        /// Its root.
+        root: Label,
+        /// Parts that are not where the object has them, nor along their known joint.
+        unexplained: Vec<Label>,
+        /// Parts that the object did not have; they are added.
+        unknown: Vec<Label>,
+    },
     /// A window was learned.
     Learned {
         /// Seconds since time zero of its first and last frame.
@@ -96,6 +110,14 @@ pub struct Pipeline {
     recent: Vec<BTreeMap<Label, Pose>>,
     moving: bool,
     forecaster: Option<Forecaster>,
+    /// The latest stamp of a frame.
+    newest: Option<Stamp>,
+    /// A saved object that waits for the stream's first frame.
+    resumed: Option<Box<Resumed>>,
+    /// Where the stream's own time zero is on the object's clock \[s\].
+    begin_s: f64,
+    /// Frames at rest that show parts which the saved object does not have.
+    newcomers: Option<Vec<Frame>>,
 }
 
 impl Pipeline {
@@ -117,6 +139,10 @@ impl Pipeline {
             current: BTreeMap::new(),
             recent: Vec::new(),
             moving: false,
+            newest: None,
+            resumed: None,
+            begin_s: 0.0,
+            newcomers: None,
         }
     }
 
@@ -159,8 +185,12 @@ impl Pipeline {
     }
 
     fn push_frame(&mut self, stamp: Stamp, clouds: &[crate::types::SegmentedCloud]) -> Vec<Output> {
-        let zero =
-            *self.zero.get_or_insert_with(|| self.early.iter().map(Input::stamp).chain([stamp]).min().unwrap_or(stamp));
+        let zero = self.zero.unwrap_or_else(|| {
+            let first = self.early.iter().map(Input::stamp).chain([stamp]).min();
+            self.time_zero(first.unwrap_or(stamp))
+        });
+        self.zero = Some(zero);
+        self.newest = self.newest.max(Some(stamp));
         let cutter = self.cutter.get_or_insert_with(|| WindowCutter::new(self.settings.windows, zero));
         for input in self.early.drain(..) {
             if let Input::Wrench(wrench) = input {
@@ -168,7 +198,8 @@ impl Pipeline {
             }
         }
         let frame = frame_of(stamp.seconds_since(zero), clouds);
-        let mut outputs = self.observe(&frame);
+        let mut outputs: Vec<Output> = self.take_up(&frame, zero).into_iter().collect();
+        outputs.extend(self.observe(&frame));
         let moving = self.moving;
         let seen = self.forecaster.is_some().then(|| frame.clone());
         if !self.cutter.as_ref().is_some_and(WindowCutter::is_open) && self.learner.is_none() {
@@ -182,7 +213,16 @@ impl Pipeline {
                 });
             }
         }
+        if let Some(frames) = self.newcomers.as_mut().filter(|frames| frames.len() < REFERENCE_FRAMES) {
+            frames.push(frame.clone());
+        }
         let job = self.cutter.as_mut().and_then(|c| c.push_frame(frame, moving, nearest_label));
+        if self.cutter.as_ref().is_some_and(WindowCutter::is_open)
+            && let Some(frames) = self.newcomers.take()
+            && let Some(learner) = &mut self.learner
+        {
+            learner.add_parts(&frames);
+        }
         if self.learner.is_none() && self.cutter.as_ref().is_some_and(WindowCutter::is_open) {
             self.open_reference();
         }
@@ -215,6 +255,8 @@ impl Pipeline {
         });
         let mut learner = Learner::new(root, self.settings.use_tool, accumulators);
         learner.settings = self.settings.kinematics;
+        learner.kept_windows = self.settings.windows.kept;
+        learner.root_is_given = self.settings.root.is_some();
         learner.dynamics = DynamicsLearner::new(self.gravity_in_work());
         learner.calibrate(&self.reference);
         self.reference.clear();

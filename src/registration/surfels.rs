@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use nalgebra::{Matrix3, Vector3};
+use serde::{Deserialize, Serialize};
 
 use super::ScanPoint;
 use super::field::NearestField;
@@ -29,7 +30,7 @@ const GOLDEN: f64 = 1.618_033_988_749_895;
 const FULL_VOXEL: f64 = 400.0;
 
 /// A small piece of surface at the reference configuration.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Surfel {
     /// Centre \[m\].
     pub point: Vector3<f64>,
@@ -236,7 +237,8 @@ fn fit_plane(surfels: &[Surfel], members: &[usize]) -> (Vector3<f64>, Vector3<f6
 }
 
 /// A part's surfels with a nearest-surfel look-up, at the reference configuration.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(from = "StoredModel")]
 pub struct PartModel {
     /// The surfels.
     pub surfels: Vec<Surfel>,
@@ -244,7 +246,22 @@ pub struct PartModel {
     pub centroid: Vector3<f64>,
     /// Root-mean-square distance from the centroid \[m\]: scales rotations to lengths.
     pub radius: f64,
+    #[serde(skip_serializing)]
     pub(super) field: NearestField,
+}
+
+/// A model without what follows from its surfels.
+#[derive(Deserialize)]
+struct StoredModel {
+    surfels: Vec<Surfel>,
+    centroid: Vector3<f64>,
+    radius: f64,
+}
+
+impl From<StoredModel> for PartModel {
+    fn from(StoredModel { surfels, centroid, radius }: StoredModel) -> Self {
+        Self { field: NearestField::new(&surfels), surfels, centroid, radius }
+    }
 }
 
 impl PartModel {
