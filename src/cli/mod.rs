@@ -1,5 +1,6 @@
 //! Subcommands, their options, logging.
 
+mod evaluate;
 mod progress;
 mod recording;
 mod replay;
@@ -7,6 +8,7 @@ mod replay;
 use std::io::{self, Write};
 
 use anyhow::Context;
+use bayesian_object_models::types::Label;
 use clap::{Parser, Subcommand};
 use tracing_subscriber::EnvFilter;
 
@@ -28,6 +30,7 @@ pub struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Command {
     Replay(replay::ReplayArguments),
+    Evaluate(evaluate::EvaluateArguments),
 }
 
 /// Does what was asked.
@@ -35,6 +38,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     start_logging(arguments.log_level.as_deref())?;
     match &arguments.command {
         Command::Replay(arguments) => replay::run(arguments),
+        Command::Evaluate(arguments) => evaluate::run(arguments),
     }
 }
 
@@ -55,6 +59,11 @@ fn start_logging(level: Option<&str>) -> anyhow::Result<()> {
     };
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(progress::AboveTheBar::new).without_time().init();
     Ok(())
+}
+
+/// What is wrong where a saved model's root is not where the first frame has it.
+fn other_object(model: &str, root: Label) -> String {
+    format!("{model}: another object, or it stands elsewhere: part {root}, its root, is not where the model has it")
 }
 
 /// Prints to standard output; a reader that has gone away is no failure.

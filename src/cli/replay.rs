@@ -1,6 +1,7 @@
 //! `bom replay`: the whole pipeline over a recorded bag.
 
 use std::collections::BTreeSet;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -19,6 +20,8 @@ use bayesian_object_models::{
     pipeline::{Output, Pipeline},
     report::{
         displacement_csv::{self, Row, center_std},
+        html::{Evidence, page},
+        series::Gatherer,
         table::{Run, table},
     },
     types::{Input, Label, Stamp},
@@ -53,6 +56,9 @@ pub struct ReplayArguments {
     /// Write what was read, as a bag: replaying it gives the same posterior
     #[arg(long, value_name = "OUT.mcap")]
     record: Option<PathBuf>,
+    /// Write a report for people, one HTML file
+    #[arg(long, value_name = "OUT.html")]
+    report: Option<PathBuf>,
     /// Save what was learned, for --load-model and evaluate
     #[arg(long, value_name = "OUT.json")]
     save_model: Option<PathBuf>,
@@ -84,15 +90,17 @@ pub fn run(arguments: &ReplayArguments) -> anyhow::Result<()> {
     remarks.extend(replay.ingest.diagnostics().iter().map(ToString::to_string));
     remarks.append(&mut replay.remarks);
     let document = replay.document(arguments, &bag)?;
-    outputs.finish(&document, &mut replay)?;
-    print(&table(&Run {
-        bag: &arguments.bag.display().to_string(),
+    let bag_name = arguments.bag.display().to_string();
+    let run = Run {
+        bag: &bag_name,
         document: &document,
         root_is_given: replay.root_is_given,
         stream_s: replay.span.map_or(0.0, |(first, last)| last.seconds_since(first)),
         wall_s: begin.elapsed().as_secs_f64(),
         remarks: &remarks,
-    }))
+    };
+    outputs.finish(&run, &mut replay)?;
+    print(&table(&run))
 }
 
 /// The core reads no clock; this does, for `inference_wall_s` and the table.
@@ -106,6 +114,7 @@ struct Outputs {
     posterior: Option<OutputFile>,
     observations: Option<OutputFile>,
     predictions: Option<OutputFile>,
+    report: Option<OutputFile>,
     model: Option<OutputFile>,
     recording: Option<Recording>,
 }
@@ -124,6 +133,7 @@ impl Outputs {
             posterior: create(&arguments.posterior)?,
             observations: table(&arguments.observations, false)?,
             predictions: table(&arguments.predictions, true)?,
+            report: create(&arguments.report)?,
             model: create(&arguments.save_model)?,
             recording: arguments.record.as_deref().map(Recording::create).transpose()?,
         })
@@ -135,13 +145,20 @@ impl Outputs {
     }
 
     /// Completes the files.
-    fn finish(self, document: &PosteriorDocument, replay: &mut Replay) -> anyhow::Result<()> {
+    fn finish(self, run: &Run<'_>, replay: &mut Replay) -> anyhow::Result<()> {
+        if let Some(mut file) = self.report {
+            let gatherer = replay.gatherer.take().unwrap_or_default();
+            let zero = replay.pipeline.stream_zero().unwrap_or_default();
+            let evidence = Evidence { gatherer: &gatherer, learner: replay.pipeline.learner(), zero };
+            file.write_all(page(run, &evidence).as_bytes()).map_err(|error| file.fail(error))?;
+            file.finish()?;
+        }
         for file in [self.observations, self.predictions].into_iter().flatten() {
             file.finish()?;
         }
         if let Some(mut file) = self.posterior {
             let name = file.path().display().to_string();
-            document.write(&mut file).context(name)?;
+            run.document.write(&mut file).context(name)?;
             file.finish()?;
         }
         if let Some(mut file) = self.model {
@@ -173,6 +190,8 @@ struct Replay {
     span: Option<(Stamp, Stamp)>,
     /// Of each window's learning, in order.
     inference_wall: Vec<Duration>,
+    /// For the report.
+    gatherer: Option<Gatherer>,
     /// Lines for the table.
     remarks: Vec<String>,
 }
@@ -180,7 +199,7 @@ struct Replay {
 impl Replay {
     fn new(arguments: &ReplayArguments, config: &Config) -> anyhow::Result<Self> {
         let mut settings = config.pipeline_settings(arguments.root_label.map(Label));
-        settings.predict = arguments.predictions.is_some();
+        settings.predict = arguments.predictions.is_some() || arguments.report.is_some();
         let mut root_is_given = arguments.root_label.is_some();
         let mut learned_bags = Vec::new();
         let pipeline = match &arguments.load_model {
@@ -205,6 +224,7 @@ impl Replay {
             seen: BTreeSet::new(),
             span: None,
             inference_wall: Vec::new(),
+            gatherer: arguments.report.is_some().then(Gatherer::default),
             remarks: Vec::new(),
         })
     }
@@ -236,6 +256,9 @@ impl Replay {
         let stamp = input.stamp();
         let (first, last) = self.span.unwrap_or((stamp, stamp));
         self.span = Some((first.min(stamp), last.max(stamp)));
+        if let (Some(gatherer), Input::Wrench(wrench)) = (&mut self.gatherer, &input) {
+            gatherer.wrench(wrench);
+        }
         self.timed(|pipeline| pipeline.push(input), files)
     }
 
@@ -254,6 +277,9 @@ impl Replay {
     }
 
     fn take(&mut self, output: &Output, files: &mut Outputs) -> anyhow::Result<()> {
+        if let Some(gatherer) = &mut self.gatherer {
+            gatherer.output(output);
+        }
         match output {
             Output::Observation { time_s, label, measurement } => {
                 self.seen.insert(*label);
@@ -276,6 +302,8 @@ impl Replay {
                 };
                 Outputs::write_row(&mut files.predictions, &row)?;
             }
+            // A replay learns in the stream.
+            Output::WindowClosed(_) => {}
             Output::Learned { span_s } => tracing::info!(from_s = span_s.0, to_s = span_s.1, "window learned"),
             Output::Resumed { root, unexplained, unknown } => self.taken_up(*root, unexplained, unknown)?,
         }
@@ -286,7 +314,7 @@ impl Replay {
     fn taken_up(&mut self, root: Label, unexplained: &[Label], unknown: &[Label]) -> anyhow::Result<()> {
         let name = &self.model_name;
         if unexplained.contains(&root) || unknown.contains(&root) {
-            bail!("{name}: another object, or it stands elsewhere: part {root}, its root, is not where the model has it");
+            bail!("{}", super::other_object(name, root));
         }
         let all = |labels: &[Label]| labels.iter().map(Label::to_string).collect::<Vec<_>>().join(", ");
         if !unexplained.is_empty() {
@@ -321,15 +349,20 @@ impl Replay {
 
 /// Fails if a model has learned the bag.
 fn refuse_known(path: &Path, learned: &[String], config: &InputConfig) -> anyhow::Result<()> {
-    let mut hash = BagHash::default();
-    for message in Bag::open(path)? {
-        hash.add(&message, config);
-    }
-    let hash = hash.finish();
+    let hash = bag_hash(path, config)?;
     if learned.contains(&hash) {
         bail!("{}: the model has learned this bag already (content {})", path.display(), &hash[..12]);
     }
     Ok(())
+}
+
+/// The content hash of a bag.
+pub fn bag_hash(path: &Path, config: &InputConfig) -> anyhow::Result<String> {
+    let mut hash = BagHash::default();
+    for message in Bag::open(path)? {
+        hash.add(&message, config);
+    }
+    Ok(hash.finish())
 }
 
 fn why_nothing(counters: &Counters, ingest: &Ingest) -> String {

@@ -240,7 +240,8 @@ fn start_positions(joint: &KinematicJoint, window: &WindowObservations, rests: b
     positions
 }
 
-fn nearest_position(joint: &KinematicJoint, screw: &Screw, measured: &PoseMeasurement, start: f64) -> f64 {
+/// The joint position whose displacement is nearest a measured one, from `start`.
+pub fn nearest_position(joint: &KinematicJoint, screw: &Screw, measured: &PoseMeasurement, start: f64) -> f64 {
     let residual = |q: f64| {
         (Pose::from_translation(-joint.center)
             * measured.displacement.inverse()

@@ -26,6 +26,8 @@ use crate::types::Label;
 const EXPLAINED: f64 = 0.12;
 /// A tool track explained to this root mean square is explained \[m\].
 const TOOL_EXPLAINED: f64 = 0.003;
+/// Excess at which a part that was taken for the root is looked at like the others.
+const LEFT: f64 = 0.6;
 /// Share of the largest eigenvalue of a factor that rough normals may pretend to hold.
 pub const FALSE_SHARE: f64 = 0.01;
 /// A motion may start this far from where the part was, before it costs \[m\].
@@ -54,6 +56,7 @@ pub struct Baseline {
 }
 
 /// What a window's motion is explained with.
+#[derive(Clone, Copy)]
 pub struct Scene<'a> {
     /// The window's frames.
     pub frames: &'a [Frame],
@@ -123,6 +126,16 @@ pub fn explain_window(scene: &Scene<'_>) -> BTreeMap<Label, Motion> {
 }
 
 impl Scene<'_> {
+    /// Whether a part cannot have stayed where it was: what comes into view as others move is no sign.
+    pub fn has_left(&self, label: Label) -> bool {
+        if !self.models.contains_key(&label) {
+            return false;
+        }
+        let still = self.evaluate(label, |_| self.start_of(label));
+        tracing::debug!(%label, excess = still.excess, miss = self.tool_miss(label, &still.displacements), "root");
+        still.excess > LEFT || self.tool_miss(label, &still.displacements) > TOOL_EXPLAINED
+    }
+
     fn start_of(&self, label: Label) -> Pose {
         self.start.get(&label).copied().unwrap_or_else(Pose::identity)
     }

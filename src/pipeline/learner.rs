@@ -50,6 +50,14 @@ pub struct WindowJob {
     pub zero: crate::types::Stamp,
 }
 
+impl WindowJob {
+    /// Seconds since time zero of its first and last frame.
+    pub fn span_s(&self) -> (f64, f64) {
+        let time = |frame: Option<&Frame>| frame.map_or(0.0, |frame| frame.time_s);
+        (time(self.frames.first()), time(self.frames.last()))
+    }
+}
+
 /// Evidence for one parent of a part.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct ParentEvidence {
@@ -80,7 +88,7 @@ impl ParentEvidence {
 }
 
 /// Kinematic state of everything learned.
-#[derive(Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Learner {
     /// The part fixed to the world.
     pub root: Label,
@@ -88,7 +96,8 @@ pub struct Learner {
     pub root_is_given: bool,
     /// Whether the tool's position is an observation.
     pub use_tool: bool,
-    /// Reference models.
+    /// Reference models; saved apart.
+    #[serde(skip)]
     pub models: BTreeMap<Label, PartModel>,
     /// Surfels of the first look.
     pub(super) reference: BTreeMap<Label, Vec<Surfel>>,
@@ -187,9 +196,9 @@ impl Learner {
         }
     }
 
-    /// Learns one window.
-    pub fn learn(&mut self, job: &WindowJob) {
-        let scene = Scene {
+    /// What a window's motion is explained with.
+    pub(super) fn scene<'a>(&'a self, job: &'a WindowJob) -> Scene<'a> {
+        Scene {
             frames: &job.frames,
             contacts: &job.contacts,
             models: &self.models,
@@ -197,10 +206,16 @@ impl Learner {
             start: &self.displacements,
             joints: self.joints(),
             touched_before: &self.touched,
-            root: self.root_is_given.then_some(self.root),
+            root: Some(self.root),
             use_tool: self.use_tool,
-        };
-        let motions = explain_window(&scene);
+        }
+    }
+
+    /// Learns one window.
+    pub fn learn(&mut self, job: &WindowJob) {
+        let scene = self.scene(job);
+        let doubted = !self.root_is_given && scene.has_left(self.root);
+        let motions = explain_window(&Scene { root: (!doubted).then_some(self.root), ..scene });
         for (label, motion) in &motions {
             tracing::debug!(%label, moved = motion.moved, excess = motion.excess, seed = ?motion.seed, "motion");
         }

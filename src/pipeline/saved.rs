@@ -3,6 +3,9 @@
 //! The saved object's frame, its reference configuration and its time go on. The first frame of the new
 //! stream tells where the joints are now; parts that the object did not have are added as they stand.
 
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -12,7 +15,9 @@ use super::working_frame::WorkingFrame;
 use super::{Learner, Output, Pipeline, PipelineSettings};
 use crate::math::Pose;
 use crate::model::KinematicJoint;
-use crate::registration::{JointFrame, OUTLIER_COST, PartModel, ScanPoint, SurfelAccumulator, search_path, truncated_cost};
+use crate::registration::{
+    JointFrame, OUTLIER_COST, PartModel, ScanPoint, Surfel, SurfelAccumulator, search_path, truncated_cost,
+};
 use crate::types::{Label, Stamp};
 
 /// A part whose first scan costs this much more than it should is not where the object has it.
@@ -31,6 +36,8 @@ pub struct SavedObjectRef<'a> {
     gravity_in_world: Vector3<f64>,
     zero: Stamp,
     newest: Stamp,
+    /// Surfels of each part that came into view later.
+    grown: BTreeMap<Label, Vec<Surfel>>,
     learner: &'a Learner,
 }
 
@@ -41,6 +48,7 @@ pub struct SavedObject {
     gravity_in_world: Vector3<f64>,
     zero: Stamp,
     newest: Stamp,
+    grown: BTreeMap<Label, Vec<Surfel>>,
     learner: Learner,
 }
 
@@ -88,12 +96,15 @@ impl Pipeline {
     /// What was learned, for saving; `None` before the first window.
     pub fn saved(&self) -> Option<SavedObjectRef<'_>> {
         let WorkingFrame::Known(world_from_work) = self.working_frame else { return None };
+        let learner = self.learner.as_deref()?;
+        let grown = |model: &PartModel| model.surfels.iter().filter(|surfel| surfel.grown).copied().collect();
         Some(SavedObjectRef {
             world_from_work,
             gravity_in_world: self.settings.gravity_in_world,
             zero: self.zero?,
             newest: self.newest?,
-            learner: self.learner.as_ref()?,
+            grown: learner.models.iter().map(|(label, model)| (*label, grown(model))).collect(),
+            learner,
         })
     }
 
@@ -102,7 +113,8 @@ impl Pipeline {
     /// # Errors
     /// If the settings contradict what was saved.
     pub fn resume(settings: PipelineSettings, saved: SavedObject) -> Result<Self, ResumeError> {
-        let SavedObject { world_from_work, gravity_in_world, zero, newest, mut learner } = saved;
+        let SavedObject { world_from_work, gravity_in_world, zero, newest, grown, mut learner } = saved;
+        learner.restore_models(&grown);
         if let Some(asked) = settings.root.filter(|root| *root != learner.root) {
             return Err(ResumeError::Root { saved: learner.root, asked });
         }
@@ -144,12 +156,21 @@ impl Pipeline {
             forecaster.resumed(&learner, frame.time_s, positions);
         }
         let root = learner.root;
-        self.learner = Some(learner);
+        self.learner = Some(Arc::new(learner));
         Some(Output::Resumed { root, unexplained, unknown })
     }
 }
 
 impl Learner {
+    /// The models, which are not saved: their faces of the first look are, and those of later.
+    fn restore_models(&mut self, grown: &BTreeMap<Label, Vec<Surfel>>) {
+        let none = Vec::new();
+        let model = |(label, first): (&Label, &Vec<Surfel>)| {
+            Some((*label, PartModel::grown(first, grown.get(label).unwrap_or(&none))?))
+        };
+        self.models = self.reference.iter().filter_map(model).collect();
+    }
+
     /// Finds where the known joints are in a frame, parents first, and with them every part; returns
     /// their positions. What has no known joint stays where it was.
     fn locate(&mut self, frame: &Frame) -> Vec<f64> {
@@ -186,7 +207,7 @@ impl Learner {
 
     /// Adds parts that are not known yet, as they stand in these frames.
     pub(super) fn add_parts(&mut self, frames: &[Frame]) {
-        let mut accumulators: std::collections::BTreeMap<Label, SurfelAccumulator> = Default::default();
+        let mut accumulators: BTreeMap<Label, SurfelAccumulator> = BTreeMap::new();
         for frame in frames {
             for (label, scan) in frame.scans.iter().filter(|(label, _)| !self.models.contains_key(label)) {
                 accumulators.entry(*label).or_default().add(scan, &Pose::identity());

@@ -92,7 +92,7 @@ struct WindowMemory {
 }
 
 /// Learns the dynamics from windows, given the kinematic fit of all of them.
-#[derive(Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct DynamicsLearner {
     gravity: Vector3<f64>,
     pub(super) belief: Belief<Block, Site>,
