@@ -65,6 +65,13 @@ impl TrackedMechanism {
         })
     }
 
+    /// The same with no more than the declared physics; `None` if that makes no tree.
+    pub fn without_effects(&self) -> Option<Self> {
+        let mut bodies = self.tree.bodies().to_vec();
+        bodies.iter_mut().for_each(|body| body.parameters.effects.clear());
+        Some(Self { tree: Tree::new(bodies, self.tree.gravity()).ok()?, ..self.clone() })
+    }
+
     /// The body of a part.
     pub fn body(&self, label: Label) -> Option<usize> {
         self.joints.iter().position(|joint| joint.child == label)

@@ -8,6 +8,7 @@ mod filter;
 mod forecast;
 mod free;
 mod mechanism;
+mod score;
 #[cfg(test)]
 mod tests;
 
@@ -15,3 +16,4 @@ pub use filter::{Filter, Held};
 pub use forecast::{Forecast, Snapshot};
 pub use free::FreePart;
 pub use mechanism::TrackedMechanism;
+pub use score::{MeasuredPath, ResidualSum};
