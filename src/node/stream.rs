@@ -261,6 +261,15 @@ impl Stream {
                     self.announcer.observed(label, measurement.displacement);
                     observed = Some(Stamp(zero.plus_seconds(time_s).0 - self.shift_ns));
                 }
+                Output::Resumed { root, unexplained, unknown } => {
+                    info!(%root, "goes on with a saved object");
+                    for label in unexplained {
+                        warn!(%label, "part is not where its joint could have it");
+                    }
+                    for label in unknown {
+                        warn!(%label, "part is not in the saved object: added");
+                    }
+                }
                 Output::Learned { .. } => {}
             }
         }
