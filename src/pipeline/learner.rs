@@ -263,6 +263,7 @@ impl Learner {
         }
         let Some(fit) = &self.fit else {
             self.inferences.push(WindowInference::default());
+            self.dynamics.keep_window(&job.contacts);
             return;
         };
         let windows: Vec<&WindowObservations> = self.windows.iter().collect();
@@ -522,15 +523,29 @@ impl Learner {
     fn fit_joints(&mut self) {
         let tree = self.likeliest();
         let index = |label: Label| tree.iter().position(|(l, ..)| *l == label);
-        let joints: Vec<KinematicJoint> = tree
+        // An edge is fitted anew after every window and may find its axis the other way round; what
+        // was learned of a joint counts along the direction that it had.
+        let turned: Vec<bool> = tree
             .iter()
             .map(|(child, parent, joint_type, axis)| {
+                self.joints().iter().any(|old| {
+                    let old_parent = old.parent.map(|p| self.joints()[p].child);
+                    (old.child, old_parent, old.joint_type) == (*child, *parent, *joint_type)
+                        && old.axis.direction.dot(&axis.direction) < 0.0
+                })
+            })
+            .collect();
+        let sign = |joint: usize| if turned[joint] { -1.0 } else { 1.0 };
+        let joints: Vec<KinematicJoint> = tree
+            .iter()
+            .enumerate()
+            .map(|(joint, (child, parent, joint_type, axis))| {
                 let part = self.part(*child);
                 KinematicJoint {
                     parent: parent.and_then(index),
                     child: *child,
                     joint_type: *joint_type,
-                    axis: *axis,
+                    axis: Axis { direction: axis.direction * sign(joint), ..*axis },
                     center: part.center,
                     radius: part.radius,
                     suggested: self.suggested_direction(*child, *parent, &axis.direction),
@@ -543,12 +558,16 @@ impl Learner {
         let positions = (0..self.windows.len())
             .map(|w| {
                 tree.iter()
-                    .map(|(child, parent, joint_type, _)| {
+                    .enumerate()
+                    .map(|(joint, (child, parent, joint_type, _))| {
                         self.evidence[child]
                             .iter()
                             .find(|o| o.parent == *parent)
                             .and_then(|o| o.fits[*joint_type as usize].as_ref())
-                            .map_or_else(|| vec![0.0; self.windows[w].times_s.len()], |f| f.positions[w].clone())
+                            .map_or_else(
+                                || vec![0.0; self.windows[w].times_s.len()],
+                                |f| f.positions[w].iter().map(|q| q * sign(joint)).collect(),
+                            )
                     })
                     .collect()
             })

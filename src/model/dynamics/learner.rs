@@ -130,6 +130,11 @@ impl DynamicsLearner {
         }
     }
 
+    /// Keeps a window in which no joint is known yet: it is learned with the first that follows.
+    pub fn keep_window(&mut self, contacts: &[Contact]) {
+        self.windows.push(WindowMemory { contacts: contacts.to_vec(), ..WindowMemory::default() });
+    }
+
     /// Learns the newest window, and older ones again as the budget allows.
     pub fn learn_window(&mut self, fit: &KinematicFit, input: &DynamicsInput<'_>) -> WindowInference {
         self.windows.resize_with(input.windows.len(), WindowMemory::default);
