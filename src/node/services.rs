@@ -130,9 +130,12 @@ impl Managed {
             rest.is_some_and(|rest| depth == 0 || (rest.matches('.').count() as u64) < depth)
         };
         let names: Vec<String> = parameters.names().filter(wanted).map(str::to_owned).collect();
-        let mut above: Vec<String> =
-            names.iter().filter_map(|name| name.rsplit_once('.')).map(|(prefix, _)| prefix.to_owned()).collect();
-        above.sort();
+        let mut above: Vec<String> = names
+            .iter()
+            .filter(|_| depth > 0)
+            .filter_map(|name| name.rsplit_once('.'))
+            .map(|(prefix, _)| prefix.to_owned())
+            .collect();
         above.dedup();
         ListParametersResult { names, prefixes: above }
     }

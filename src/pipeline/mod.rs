@@ -39,6 +39,8 @@ pub struct PipelineSettings {
     pub root: Option<Label>,
     /// Whether the tool's position is an observation of the part it holds.
     pub use_tool: bool,
+    /// Points of a part that are used of a frame at most; 0: all.
+    pub points_per_part: usize,
     /// When windows open and close.
     pub windows: WindowSettings,
     /// What is assumed of the pose measurements.
@@ -185,7 +187,7 @@ impl Pipeline {
                 cutter.push_wrench(wrench);
             }
         }
-        let frame = frame_of(stamp.seconds_since(zero), clouds);
+        let frame = frame_of(stamp.seconds_since(zero), clouds, self.settings.points_per_part);
         let mut outputs = self.observe(&frame);
         let moving = self.moving;
         let seen = self.forecaster.is_some().then(|| frame.clone());
