@@ -4,13 +4,16 @@
 //! world's frame would give another posterior. So: z up, origin and x from the first cloud, all
 //! input carried in, all output carried out. Without gravity, z is the cloud's thinnest direction.
 
+use std::collections::BTreeMap;
+
 use nalgebra::{Matrix3, Matrix6, Vector3};
 
 use super::{Output, Pipeline};
+use crate::geometry::{HullProperties, hull_properties};
 use crate::math::Pose;
 use crate::model::PoseMeasurement;
 use crate::types::posterior::ObjectPosterior;
-use crate::types::{AppliedWrench, Input, LabelledPoint};
+use crate::types::{AppliedWrench, Input, Label, LabelledPoint};
 
 /// Gravity weaker than this says nothing of up \[m/s²\].
 const LEAST_GRAVITY: f64 = 1e-3;
@@ -53,6 +56,27 @@ impl Pipeline {
     /// What is believed now; before the first window, the prior. `None` while no part was seen.
     pub fn posterior(&self) -> Option<ObjectPosterior> {
         Some(self.posterior_in_work()?.carried_by(&self.world_from_work()))
+    }
+
+    /// Hulls of the parts as seen so far, in world at the first frame.
+    pub fn hulls(&self) -> BTreeMap<Label, HullProperties> {
+        let world_from_work = self.world_from_work();
+        let in_world = |points: Vec<Vector3<f64>>| -> Vec<Vector3<f64>> {
+            points.iter().map(|p| world_from_work.transform_point(p)).collect()
+        };
+        let surfaces = self.surfaces_in_work().into_iter();
+        surfaces.filter_map(|(label, points)| Some((label, hull_properties(&in_world(points), None)?))).collect()
+    }
+
+    /// Least and greatest position of each joint of the likeliest tree in the windows learned, by child
+    /// \[m or rad\].
+    pub fn ranges_seen(&self) -> BTreeMap<Label, (f64, f64)> {
+        let Some(fit) = self.learner().and_then(|learner| learner.fit.as_ref()) else { return BTreeMap::new() };
+        let range = |joint: usize| {
+            let seen = fit.positions.iter().filter_map(|window| window.get(joint)).flatten().copied();
+            seen.fold((0.0, 0.0), |(least, greatest): (f64, f64), q| (least.min(q), greatest.max(q)))
+        };
+        fit.joints.iter().enumerate().map(|(index, joint)| (joint.child, range(index))).collect()
     }
 
     pub(super) fn gravity_in_work(&self) -> Vector3<f64> {
@@ -153,7 +177,6 @@ fn turned(information: &Matrix6<f64>, rotation: &Matrix3<f64>) -> Matrix6<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::types::Label;
     use nalgebra::UnitQuaternion;
 
     fn points() -> Vec<LabelledPoint> {
