@@ -109,6 +109,8 @@ impl Parameters {
              "A warning says when clouds come more slowly than this [Hz]."),
             ("wrench_timeout_s", Value::Double(0.3), Some((0.01, 60.0)), Change::Always,
              "A warning says when a wrench topic has been silent for this long [s]."),
+            ("mesh_folder", Value::String(String::new()), None, Change::AtStart,
+             "Folder, an absolute path, that the meshes of ~/robot_description are written to; empty: parts are boxes."),
             ("worker_threads", Value::Integer(0), Some((0.0, 1024.0)), Change::AtStart,
              "Threads that inference may use; 0: all cores but one."),
         ];
@@ -328,7 +330,7 @@ fn checked(name: &str, declaration: &Declaration, value: &Value) -> Result<Value
 fn is_of_config(name: &str) -> bool {
     let live = ["root_label", "use_sim_time", "autostart", "publish_tf", "slowest_clouds_hz", "wrench_timeout_s"];
     !live.contains(&name)
-        && name != "worker_threads"
+        && !["worker_threads", "mesh_folder"].contains(&name)
         && !name.starts_with("qos_overrides.")
         && !name.starts_with("input.wrenches.")
 }

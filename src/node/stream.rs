@@ -10,6 +10,7 @@ use tokio::sync::oneshot;
 use tracing::{info, warn};
 
 use super::announce::Announcer;
+use super::drawing::Drawing;
 use super::health::{SharedHealth, now};
 use super::inbox::{Arrival, Inbox};
 use super::learning::Learning;
@@ -54,7 +55,6 @@ pub enum Command {
 pub struct Stream {
     inbox: Arc<Inbox<Command>>,
     learning: Learning,
-    outputs: Outputs,
     health: SharedHealth,
     ingest: Ingest,
     input: InputConfig,
@@ -79,15 +79,14 @@ impl Stream {
     pub fn new(
         inbox: Arc<Inbox<Command>>,
         learning: Learning,
-        outputs: Outputs,
+        (outputs, drawing): (Outputs, Drawing),
         health: SharedHealth,
         input: InputConfig,
     ) -> Self {
         Self {
             inbox,
             learning,
-            announcer: Announcer::new(outputs.clone(), input.fixed_frame.clone()),
-            outputs,
+            announcer: Announcer::new(outputs, drawing, input.fixed_frame.clone()),
             health,
             ingest: Ingest::new(&input),
             input,
@@ -130,7 +129,6 @@ impl Stream {
             Command::Configure(settings) => {
                 let (input, settings) = *settings;
                 self.ingest = self.ingest.anew(&input);
-                self.announcer = Announcer::new(self.outputs.clone(), input.fixed_frame.clone());
                 self.input = input;
                 self.settings = Some(settings);
                 self.begin();
@@ -174,9 +172,9 @@ impl Stream {
         self.newest_of_camera.clear();
         self.arrivals.clear();
         self.ingest.begin_again();
-        self.announcer.begin();
+        self.announcer.begin(&self.input.fixed_frame);
         if let Some(settings) = &self.settings {
-            self.announcer.prior(None, settings.root, self.ingest.counters());
+            self.announcer.prior(settings.root, self.ingest.counters());
         }
     }
 
@@ -280,15 +278,16 @@ impl Stream {
         }
         self.reported = at;
         let (readings, clouds, superseded, overflown) = self.inbox.state();
-        let missing: BTreeMap<String, String> =
-            self.ingest.waiting().into_iter().map(|(topic, error)| (topic, error.to_string())).collect();
+        let missing = self.ingest.waiting();
         let mut health = self.health.lock();
         health.counters = self.ingest.counters().clone();
         health.queued = (readings, clouds);
         health.dropped = (superseded, overflown);
-        health.no_tf.retain(|topic, _| missing.contains_key(topic));
-        for (topic, text) in missing {
-            health.no_tf.entry(topic).or_insert((at, String::new())).1 = text;
+        // A message that waits is looked at as long as it is the same one.
+        let is_there = |topic: &String, stamp: Stamp| missing.iter().any(|(t, s, _)| t == topic && *s == stamp);
+        health.no_tf.retain(|topic, (_, stamp, _)| is_there(topic, *stamp));
+        for (topic, stamp, error) in &missing {
+            health.no_tf.entry(topic.clone()).or_insert((at, *stamp, String::new())).2 = error.to_string();
         }
     }
 }

@@ -49,7 +49,7 @@ impl Learner {
         posterior(self.root, &self.surfaces(), Some(self))
     }
 
-    fn surfaces(&self) -> BTreeMap<Label, Vec<Vector3<f64>>> {
+    pub(super) fn surfaces(&self) -> BTreeMap<Label, Vec<Vector3<f64>>> {
         let surface = |model: &PartModel| model.surfels.iter().map(|s| s.point).collect();
         self.models.iter().map(|(label, model)| (*label, surface(model))).collect()
     }

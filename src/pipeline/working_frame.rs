@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::{Matrix3, Matrix6, Vector3};
 
-use super::{Output, Pipeline};
+use super::{Learner, Output, Pipeline};
 use crate::geometry::{HullProperties, hull_properties};
 use crate::math::Pose;
 use crate::model::PoseMeasurement;
@@ -60,23 +60,13 @@ impl Pipeline {
 
     /// Hulls of the parts as seen so far, in world at the first frame.
     pub fn hulls(&self) -> BTreeMap<Label, HullProperties> {
-        let world_from_work = self.world_from_work();
-        let in_world = |points: Vec<Vector3<f64>>| -> Vec<Vector3<f64>> {
-            points.iter().map(|p| world_from_work.transform_point(p)).collect()
-        };
-        let surfaces = self.surfaces_in_work().into_iter();
-        surfaces.filter_map(|(label, points)| Some((label, hull_properties(&in_world(points), None)?))).collect()
+        hulls(&self.surfaces_in_work(), &self.world_from_work())
     }
 
     /// Least and greatest position of each joint of the likeliest tree in the windows learned, by child
     /// \[m or rad\].
     pub fn ranges_seen(&self) -> BTreeMap<Label, (f64, f64)> {
-        let Some(fit) = self.learner().and_then(|learner| learner.fit.as_ref()) else { return BTreeMap::new() };
-        let range = |joint: usize| {
-            let seen = fit.positions.iter().filter_map(|window| window.get(joint)).flatten().copied();
-            seen.fold((0.0, 0.0), |(least, greatest): (f64, f64), q| (least.min(q), greatest.max(q)))
-        };
-        fit.joints.iter().enumerate().map(|(index, joint)| (joint.child, range(index))).collect()
+        self.learner().map(Learner::ranges_seen).unwrap_or_default()
     }
 
     pub(super) fn gravity_in_work(&self) -> Vector3<f64> {
@@ -89,6 +79,18 @@ impl Pipeline {
             WorkingFrame::Known(pose) => pose,
         }
     }
+}
+
+/// Hulls of surfaces, carried into world.
+pub(super) fn hulls(
+    surfaces_in_work: &BTreeMap<Label, Vec<Vector3<f64>>>,
+    world_from_work: &Pose,
+) -> BTreeMap<Label, HullProperties> {
+    let in_world = |points: &[Vector3<f64>]| -> Vec<Vector3<f64>> {
+        points.iter().map(|p| world_from_work.transform_point(p)).collect()
+    };
+    let surfaces = surfaces_in_work.iter();
+    surfaces.filter_map(|(label, points)| Some((*label, hull_properties(&in_world(points), None)?))).collect()
 }
 
 /// world_from_work by the first thing seen; wrenches say nothing of it.
