@@ -1,13 +1,16 @@
 //! Subcommands, their options, logging.
 
+mod evaluate;
 mod node;
 mod progress;
+mod recording;
 mod replay;
 
 use std::io::{self, Write};
 
 use anyhow::Context;
 use bayesian_object_models::node::rosout::RosoutLayer;
+use bayesian_object_models::types::Label;
 use clap::{Parser, Subcommand};
 use tracing_subscriber::{EnvFilter, layer::SubscriberExt, util::SubscriberInitExt};
 
@@ -31,6 +34,7 @@ pub struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Command {
     Replay(replay::ReplayArguments),
+    Evaluate(evaluate::EvaluateArguments),
     Node(node::NodeArguments),
 }
 
@@ -47,6 +51,10 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
             let level = ros.log_level.as_deref().map(|level| if level == "fatal" { "error" } else { level });
             start_logging(level.or(arguments.log_level.as_deref()), NODE_LOG)?;
             node::run(&ros)
+        }
+        Command::Evaluate(evaluate) => {
+            start_logging(arguments.log_level.as_deref(), DEFAULT_LOG)?;
+            evaluate::run(evaluate)
         }
     }
 }
@@ -76,6 +84,11 @@ fn start_logging(level: Option<&str>, otherwise: &str) -> anyhow::Result<()> {
         .with(RosoutLayer)
         .init();
     Ok(())
+}
+
+/// What is wrong where a saved model's root is not where the first frame has it.
+fn other_object(model: &str, root: Label) -> String {
+    format!("{model}: another object, or it stands elsewhere: part {root}, its root, is not where the model has it")
 }
 
 /// Prints to standard output; a reader that has gone away is no failure.

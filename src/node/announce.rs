@@ -117,6 +117,14 @@ impl Announcer {
         self.believe(nothing, BTreeMap::new(), BTreeMap::new(), counters, Stamp::default());
     }
 
+    /// A saved object was taken up.
+    pub fn resumed(&mut self, pipeline: &Pipeline, stamp: Stamp, counters: &Counters, shift_ns: i64) {
+        let Some(posterior) = pipeline.posterior() else { return };
+        self.learned = true;
+        self.frame.zero = Stamp(pipeline.zero().unwrap_or_default().0 - shift_ns);
+        self.believe(posterior, pipeline.hulls(), pipeline.ranges_seen(), counters, stamp);
+    }
+
     /// A window was learned.
     pub fn learned(&mut self, pipeline: &Pipeline, learned: &Learned, counters: &Counters, shift_ns: i64) {
         self.learned = true;

@@ -1,9 +1,11 @@
 //! Services: parameters as rcl has them, the lifecycle as its managers expect it, and the node's own.
 
 use std::future::Future;
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::SystemTime;
 
+use anyhow::Context as _;
 use ros2_client::Server;
 use ros2_interfaces_jazzy_serde::lifecycle_msgs::{
     msg::{Transition as TransitionMessage, TransitionEvent},
@@ -34,6 +36,9 @@ use super::publications::{Outputs, Publication};
 use super::stream::Command;
 use super::value::Value;
 use crate::io::config::InputConfig;
+use crate::io::model_file::{SavedModel, write_model};
+use crate::io::output_file::OutputFile;
+use crate::ros::messages::{self, LoadModelRequest, LoadModelResponse, SaveModelRequest, SaveModelResponse};
 
 /// What services ask and change; cheap to share.
 #[derive(Clone)]
@@ -99,6 +104,28 @@ impl Managed {
             goal_state: goal.message(),
         }));
         Ok(goal)
+    }
+
+    /// Writes what was learned, while the stream goes on.
+    async fn save(&self, path: PathBuf) -> anyhow::Result<()> {
+        let (reply, snapshot) = oneshot::channel();
+        self.inbox.tell(Command::Snapshot(reply));
+        let (snapshot, bags) =
+            snapshot.await.context("the node is shutting down")?.context("no interaction was seen: nothing to save")?;
+        tokio::task::spawn_blocking(move || {
+            let mut file = OutputFile::create(&path)?;
+            write_model(&mut file, &bags, &snapshot.saved()).with_context(|| path.display().to_string())?;
+            file.finish().map_err(anyhow::Error::from)
+        })
+        .await?
+    }
+
+    /// Reads what was learned before, and goes on from there.
+    async fn load(&self, path: PathBuf) -> anyhow::Result<()> {
+        let model = tokio::task::spawn_blocking(move || SavedModel::from_file(&path)).await??;
+        let (reply, outcome) = oneshot::channel();
+        self.inbox.tell(Command::Resume(Box::new(model), reply));
+        outcome.await.context("the node is shutting down")?.map_err(anyhow::Error::msg)
     }
 
     fn set(&self, parameters: &[Parameter]) -> SetParametersResult {
@@ -197,6 +224,30 @@ pub fn serve(participant: &mut Participant, managed: &Managed) -> anyhow::Result
             let success = waiting.await.is_ok();
             let message = if success { "what was learned is forgotten" } else { "the node is shutting down" };
             TriggerResponse { success, message: message.to_owned() }
+        }
+    });
+    let own = managed.clone();
+    let type_name = format!("{}/srv/SaveModel", messages::PACKAGE);
+    let server = participant.serve::<SaveModelRequest, SaveModelResponse>("~/save_model", &type_name)?;
+    answer(server, move |request: SaveModelRequest| {
+        let own = own.clone();
+        async move {
+            match own.save(PathBuf::from(&request.path)).await {
+                Ok(()) => SaveModelResponse { success: true, message: format!("saved to {}", request.path) },
+                Err(error) => SaveModelResponse { success: false, message: format!("{error:#}") },
+            }
+        }
+    });
+    let own = managed.clone();
+    let type_name = format!("{}/srv/LoadModel", messages::PACKAGE);
+    let server = participant.serve::<LoadModelRequest, LoadModelResponse>("~/load_model", &type_name)?;
+    answer(server, move |request: LoadModelRequest| {
+        let own = own.clone();
+        async move {
+            match own.load(PathBuf::from(&request.path)).await {
+                Ok(()) => LoadModelResponse { success: true, message: format!("goes on from {}", request.path) },
+                Err(error) => LoadModelResponse { success: false, message: format!("{error:#}") },
+            }
         }
     });
     Ok(())

@@ -17,7 +17,8 @@ use super::learning::Learning;
 use super::publications::Outputs;
 use crate::io::config::InputConfig;
 use crate::io::ingest::{Ingest, Message};
-use crate::pipeline::{Learned, Output, Pipeline, PipelineSettings};
+use crate::io::model_file::SavedModel;
+use crate::pipeline::{Learned, Output, Pipeline, PipelineSettings, Snapshot};
 use crate::ros::PartPrediction;
 use crate::types::{Input, Stamp};
 
@@ -29,7 +30,6 @@ const REPORT_EVERY: Duration = Duration::from_millis(100);
 const JUMP_S: f64 = 1.0;
 
 /// What the stream can be told.
-#[derive(Debug)]
 pub enum Command {
     /// Begin with nothing learned, by these settings; passing over what comes.
     Configure(Box<(InputConfig, PipelineSettings)>),
@@ -41,6 +41,10 @@ pub enum Command {
     Deactivate,
     /// Forget what was learned and go on.
     Reset(oneshot::Sender<()>),
+    /// What was learned, for saving, with the bags that it knows; `None` where there is nothing yet.
+    Snapshot(oneshot::Sender<Option<(Snapshot, Vec<String>)>>),
+    /// Go on from what was learned before; whether that is possible.
+    Resume(Box<SavedModel>, oneshot::Sender<Result<(), String>>),
     /// A window was learned in this life of the pipeline.
     Adopt(u64, Box<Learned>),
     /// The clock went back.
@@ -61,6 +65,8 @@ pub struct Stream {
     settings: Option<PipelineSettings>,
     pipeline: Option<Pipeline>,
     announcer: Announcer,
+    /// Bags that a loaded model has learned.
+    bags: Vec<String>,
     active: bool,
     /// Counts the pipelines, so that what an older one handed out is not adopted by a newer.
     life: u64,
@@ -92,6 +98,7 @@ impl Stream {
             input,
             settings: None,
             pipeline: None,
+            bags: Vec::new(),
             active: false,
             life: 0,
             shift_ns: 0,
@@ -150,6 +157,13 @@ impl Stream {
                 // Whoever asked may be gone.
                 let _ = done.send(());
             }
+            Command::Snapshot(reply) => {
+                let snapshot = self.pipeline.as_ref().and_then(Pipeline::snapshot);
+                let _ = reply.send(snapshot.map(|snapshot| (snapshot, self.bags.clone())));
+            }
+            Command::Resume(model, reply) => {
+                let _ = reply.send(self.resume(*model));
+            }
             Command::Adopt(life, learned) if life == self.life => {
                 if let Some(pipeline) = &mut self.pipeline {
                     pipeline.adopt(&learned);
@@ -163,12 +177,24 @@ impl Stream {
         }
     }
 
+    /// A pipeline that goes on from a saved model.
+    fn resume(&mut self, model: SavedModel) -> Result<(), String> {
+        let settings = self.settings.clone().ok_or("the node is unconfigured: configure it first")?;
+        let root = model.object.root();
+        let pipeline = Pipeline::resume(settings, model.object).map_err(|error| error.to_string())?;
+        self.begin();
+        self.announcer.prior(Some(root), self.ingest.counters());
+        (self.pipeline, self.bags) = (Some(pipeline), model.bags);
+        Ok(())
+    }
+
     /// A new pipeline, if there are settings for one.
     fn begin(&mut self) {
         self.life += 1;
         self.learning.clear();
         self.pipeline = self.settings.clone().map(Pipeline::new);
         (self.shift_ns, self.newest, self.begin_again) = (0, None, false);
+        self.bags.clear();
         self.newest_of_camera.clear();
         self.arrivals.clear();
         self.ingest.begin_again();
@@ -258,6 +284,19 @@ impl Stream {
                 Output::Observation { time_s, label, measurement } => {
                     self.announcer.observed(label, measurement.displacement);
                     observed = Some(Stamp(zero.plus_seconds(time_s).0 - self.shift_ns));
+                }
+                Output::Resumed { root, unexplained, unknown } => {
+                    info!(%root, "goes on with a saved object");
+                    if let Some(pipeline) = &self.pipeline {
+                        let stamp = self.newest.map_or(zero, |newest| Stamp(newest.0 - self.shift_ns));
+                        self.announcer.resumed(pipeline, stamp, self.ingest.counters(), self.shift_ns);
+                    }
+                    for label in unexplained {
+                        warn!(%label, "part is not where its joint could have it");
+                    }
+                    for label in unknown {
+                        warn!(%label, "part is not in the saved object: added");
+                    }
                 }
                 Output::Learned { .. } => {}
             }
