@@ -112,7 +112,8 @@ fn replayed(name: &str, root: &str) -> (BTreeMap<String, Value>, Value) {
 #[test]
 fn a_bag_played_live_gives_what_its_replay_gives() {
     let Some(bench) = Bench::start(141, &["-p", "root_label:=4", "-p", "publish_tf:=true"]) else { return };
-    let seen = bench.peer(&["live", &bag("cabinet"), "180"]);
+    let model = bench.folder.path().join("model.json");
+    let seen = bench.peer(&["live", &bag("cabinet"), "180", model.to_str().unwrap()]);
     let note = || format!("{seen:#}\n{}", bench.log());
     assert_eq!(seen["state"], "active", "{}", note());
     assert_eq!(seen["prior"]["edges"], 0, "the prior is there from the start: {}", note());
@@ -137,6 +138,30 @@ fn a_bag_played_live_gives_what_its_replay_gives() {
     assert_eq!(seen["predicted"]["frame"], "world");
     assert_eq!(seen["predicted"]["labels"].as_array().unwrap().len(), posterior["parts"].as_array().unwrap().len());
     assert_eq!(seen["criticism"], true);
+    assert_eq!(seen["markers"], json!(["", "axes", "edges", "parts", "uncertainty"]), "{}", note());
+    assert!(seen["largest_markers"].as_u64().unwrap() < 100_000, "{}", note());
+    let description = seen["description"].as_str().unwrap();
+    for child in joints.keys() {
+        assert!(description.contains(&format!("<joint name=\"joint_{child}\"")), "{description}");
+        let moves = joints[child][1] != "rigid";
+        assert_eq!(seen["joint_states"][format!("joint_{child}")].is_number(), moves, "{}", note());
+    }
+    assert_eq!(seen["late"]["description"], true);
+    let planned = &seen["planned"];
+    for plan in ["pull", "push"] {
+        assert_eq!((&planned[plan]["success"][0], &planned[plan]["label"]), (&json!(true), &planned["part"]), "{}", note());
+        assert_eq!(planned[plan]["labels"], seen["predicted"]["labels"], "{}", note());
+        assert!(planned[plan]["variance"].as_f64().unwrap() > 0.0, "{}", note());
+    }
+    let way = |plan: &str| planned[plan]["way"].as_f64().unwrap();
+    assert!(way("pull") - way("push") > 0.02, "{}", note());
+    assert_eq!(planned["wrong"], json!([false, "part 999 has no joint that is known"]));
+    let kept = &seen["model"];
+    assert_eq!((&kept["saved"][0], &kept["reset"], &kept["loaded"][0]), (&json!(true), &json!(true), &json!(true)));
+    assert_eq!(kept["forgotten"], 0, "{}", note());
+    assert_eq!(kept["missing"][0], false);
+    assert!(kept["missing"][1].as_str().unwrap().starts_with("/nowhere/model.json: No such file"), "{}", note());
+    assert_eq!((&kept["windows"], &kept["joints"]), (&seen["windows"], &seen["joints"]), "{}", note());
     assert_eq!(seen["late"]["windows"], seen["windows"], "a late joiner gets the last posterior");
     assert!(seen["nodes"].as_array().unwrap().contains(&json!("/bom")), "{}", note());
     let tracking = &seen["diagnostics"]["bom: tracking"]["values"];
@@ -195,5 +220,26 @@ fn parameters_lifecycle_and_services_answer_rclpy() {
     let said = seen["diagnostics"]["bom: parameters"]["message"].as_str().unwrap();
     assert!(said.contains("unknown parameter `quiet`"), "{}", note());
     assert!(bench.log().contains("unknown parameter `quiet`"), "{}", note());
+    assert!(bench.stop());
+}
+
+#[test]
+fn bad_input_is_named_within_a_second_and_the_node_goes_on() {
+    let arguments = ["-p", "use_sim_time:=true", "-p", "unknown_key:=1", "-p", "wrench_timeout_s:=0.2"];
+    let Some(bench) = Bench::start(143, &arguments) else { return };
+    let seen = bench.peer(&["trouble"]);
+    let note = || format!("{seen:#}\n{}", bench.log());
+    let named = seen["found"].as_object().unwrap();
+    let wanted = ["no transform", "wrench dies", "clock stands still", "clock goes back", "slow clouds", "QoS"];
+    for trouble in wanted {
+        // In diagnostics and in the log; discovery of an unfit publisher comes before it can be named.
+        let within_s = if trouble == "QoS" { 3.0 } else { 1.2 };
+        let times = named[trouble].as_array().unwrap_or_else(|| panic!("{trouble} was not named: {}", note()));
+        assert!(times.iter().all(|time| time.as_f64().unwrap() < within_s), "{trouble}: {}", note());
+    }
+    assert!(seen["going_on"].as_u64().unwrap() >= 8, "predictions go on after the clock went back: {}", note());
+    assert_eq!(seen["state"], "active", "{}", note());
+    let parameters = seen["diagnostics"]["bom: parameters"]["message"].as_str().unwrap();
+    assert!(parameters.contains("unknown parameter `unknown_key`"), "{}", note());
     assert!(bench.stop());
 }

@@ -68,6 +68,12 @@ impl Announcer {
         self.tf = on;
     }
 
+    /// Centres of mass of all parts at the first frame \[m\].
+    pub fn centers(&self) -> BTreeMap<Label, Vector3<f64>> {
+        let parts = self.model.iter().flat_map(|model| &model.posterior.parts);
+        parts.map(|part| (part.label, part.com_in_world_m.into())).collect()
+    }
+
     /// A part's centre of mass at the first frame \[m\].
     pub fn center(&self, label: Label) -> Option<Vector3<f64>> {
         let parts = &self.model.as_ref()?.posterior.parts;

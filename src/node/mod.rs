@@ -15,6 +15,7 @@ pub mod lifecycle;
 pub mod names;
 pub mod parameters;
 pub mod participant;
+pub mod planning;
 pub mod publications;
 pub mod rosout;
 pub mod services;

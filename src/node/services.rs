@@ -30,6 +30,7 @@ use tracing::{info, warn};
 use super::health::SharedHealth;
 use super::inbox::Inbox;
 use super::lifecycle::{State, Transition};
+use super::planning;
 use super::parameters::Parameters;
 use super::participant::{Participant, Wire};
 use super::publications::{Outputs, Publication};
@@ -38,7 +39,9 @@ use super::value::Value;
 use crate::io::config::InputConfig;
 use crate::io::model_file::{SavedModel, write_model};
 use crate::io::output_file::OutputFile;
-use crate::ros::messages::{self, LoadModelRequest, LoadModelResponse, SaveModelRequest, SaveModelResponse};
+use crate::ros::messages::{
+    self, LoadModelRequest, LoadModelResponse, PredictRequest, PredictResponse, SaveModelRequest, SaveModelResponse,
+};
 
 /// What services ask and change; cheap to share.
 #[derive(Clone)]
@@ -104,6 +107,18 @@ impl Managed {
             goal_state: goal.message(),
         }));
         Ok(goal)
+    }
+
+    /// Where the parts would be under a planned wrench.
+    async fn predict(&self, request: PredictRequest) -> PredictResponse {
+        let answered = async {
+            let (reply, ground) = oneshot::channel();
+            self.inbox.tell(Command::Planner(request.header.frame_id.clone(), reply));
+            let ground = ground.await.context("the node is shutting down")?.map_err(anyhow::Error::msg)?;
+            tokio::task::spawn_blocking(move || planning::answer(&ground, &request)).await?
+        };
+        let answered: anyhow::Result<PredictResponse> = answered.await;
+        answered.unwrap_or_else(|error| PredictResponse { message: format!("{error:#}"), ..PredictResponse::default() })
     }
 
     /// Writes what was learned, while the stream goes on.
@@ -225,6 +240,13 @@ pub fn serve(participant: &mut Participant, managed: &Managed) -> anyhow::Result
             let message = if success { "what was learned is forgotten" } else { "the node is shutting down" };
             TriggerResponse { success, message: message.to_owned() }
         }
+    });
+    let own = managed.clone();
+    let type_name = format!("{}/srv/Predict", messages::PACKAGE);
+    let server = participant.serve::<PredictRequest, PredictResponse>("~/predict", &type_name)?;
+    answer(server, move |request: PredictRequest| {
+        let own = own.clone();
+        async move { own.predict(request).await }
     });
     let own = managed.clone();
     let type_name = format!("{}/srv/SaveModel", messages::PACKAGE);

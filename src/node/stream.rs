@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use nalgebra::Vector3;
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 
@@ -18,9 +19,10 @@ use super::publications::Outputs;
 use crate::io::config::InputConfig;
 use crate::io::ingest::{Ingest, Message};
 use crate::io::model_file::SavedModel;
-use crate::pipeline::{Learned, Output, Pipeline, PipelineSettings, Snapshot};
+use crate::math::Pose;
+use crate::pipeline::{Learned, Output, Pipeline, PipelineSettings, Planner, Snapshot};
 use crate::ros::PartPrediction;
-use crate::types::{Input, Stamp};
+use crate::types::{Input, Label, Stamp};
 
 /// How long the thread sleeps where nothing comes.
 const PATIENCE: Duration = Duration::from_millis(200);
@@ -45,6 +47,9 @@ pub enum Command {
     Snapshot(oneshot::Sender<Option<(Snapshot, Vec<String>)>>),
     /// Go on from what was learned before; whether that is possible.
     Resume(Box<SavedModel>, oneshot::Sender<Result<(), String>>),
+    /// What plans are answered from, with the transform from this frame into the fixed one, the stamp of
+    /// now and the parts' centres.
+    Planner(String, oneshot::Sender<Result<Box<Ground>, String>>),
     /// A window was learned in this life of the pipeline.
     Adopt(u64, Box<Learned>),
     /// The clock went back.
@@ -53,6 +58,20 @@ pub enum Command {
     PublishTf(bool),
     /// The end.
     Stop,
+}
+
+/// What a plan is answered from.
+pub struct Ground {
+    /// The stream's knowledge.
+    pub planner: Planner,
+    /// From the plan's frame.
+    pub world_from_frame: Pose,
+    /// Now.
+    pub stamp: Stamp,
+    /// Name of the fixed frame.
+    pub fixed_frame: String,
+    /// Centres of mass of the parts at the first frame \[m\].
+    pub centers: BTreeMap<Label, Vector3<f64>>,
 }
 
 /// The state of the stream.
@@ -161,6 +180,9 @@ impl Stream {
                 let snapshot = self.pipeline.as_ref().and_then(Pipeline::snapshot);
                 let _ = reply.send(snapshot.map(|snapshot| (snapshot, self.bags.clone())));
             }
+            Command::Planner(frame, reply) => {
+                let _ = reply.send(self.ground(&frame));
+            }
             Command::Resume(model, reply) => {
                 let _ = reply.send(self.resume(*model));
             }
@@ -175,6 +197,19 @@ impl Stream {
             Command::BeginAgain => self.begin_again = true,
             Command::PublishTf(on) => self.announcer.publish_tf(on),
         }
+    }
+
+    fn ground(&self, frame: &str) -> Result<Box<Ground>, String> {
+        let pipeline = self.pipeline.as_ref().ok_or("the node is unconfigured")?;
+        let planner = pipeline.planner().ok_or("no joint is known yet")?;
+        let zero = pipeline.zero().unwrap_or_default();
+        let stamp = Stamp(zero.plus_seconds(planner.time_s()).0 - self.shift_ns);
+        let fixed_frame = self.input.fixed_frame.clone();
+        let frame = if frame.is_empty() { &fixed_frame } else { frame };
+        let world_from_frame =
+            self.ingest.transforms().lookup(&fixed_frame, frame, stamp).map_err(|error| error.to_string())?;
+        let centers = self.announcer.centers();
+        Ok(Box::new(Ground { planner, world_from_frame, stamp, fixed_frame, centers }))
     }
 
     /// A pipeline that goes on from a saved model.

@@ -25,6 +25,7 @@ from rcl_interfaces.srv import (
     SetParametersAtomically,
 )
 from rclpy.node import Node
+from rclpy.serialization import serialize_message
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, PointCloud2, PointField
@@ -33,7 +34,8 @@ from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
-from bayesian_object_models.msg import Criticism, ObjectPosterior, PredictedPartPoses
+from bayesian_object_models.msg import Criticism, ObjectPosterior, PredictedPartPoses, WrenchSegment
+from bayesian_object_models.srv import LoadModel, Predict, SaveModel
 
 NODE = "/bom"
 TYPES = {
@@ -175,6 +177,39 @@ def status(message):
     }
 
 
+def plans(node, posterior):
+    """Pulls and pushes the first slide by a plan: how far it would go along its axis, with its spread."""
+    edge = next(e for e in posterior.edges if e.probability > 0.5 and e.prismatic_probability > 0.5)
+    axis = edge.prismatic[0].axis_direction
+    com = next(p.com for p in posterior.parts if p.label == edge.child)
+    found = {"part": edge.child}
+    for name, force in (("pull", 10.0), ("push", -10.0)):
+        segment = WrenchSegment(duration=0.5)
+        force += numpy.sign(force) * 2.0 * edge.friction.median
+        segment.wrench.force.x, segment.wrench.force.y, segment.wrench.force.z = (
+            force * axis.x,
+            force * axis.y,
+            force * axis.z,
+        )
+        answer = node.call(
+            "predict", Predict, label=[edge.child], point=com, profile=[segment], duration=0.5, interval=0.5, seed=1
+        )
+        pose = [p for p in answer.trajectory if p.label == edge.child]
+        t = pose[0].displacement.translation if pose else None
+        found[name] = {
+            "success": [answer.success, answer.message],
+            "label": answer.label,
+            "labels": sorted({p.label for p in answer.trajectory}),
+            "way": t.x * axis.x + t.y * axis.y + t.z * axis.z if t else None,
+            "variance": float(pose[0].center_covariance[0] + pose[0].center_covariance[4] + pose[0].center_covariance[8])
+            if pose
+            else None,
+        }
+    wrong = node.call("predict", Predict, label=[999], profile=[segment])
+    found["wrong"] = [wrong.success, wrong.message]
+    return found
+
+
 def ready(node):
     """The node is there and at work."""
     node.hear_all()
@@ -184,8 +219,9 @@ def ready(node):
     return state, bool(found)
 
 
-def live(bag, settle="60"):
-    """A whole bag: everything that the node says of it, and what a late joiner gets."""
+def live(bag, settle="60", model="/tmp/model.json"):
+    """A whole bag: everything that the node says of it, what a late joiner gets, and the object once more from
+    a saved model."""
     node = Peer()
     state, _ = ready(node)
     prior = node.last("object_posterior")
@@ -209,17 +245,29 @@ def live(bag, settle="60"):
     late.wait(lambda: late.last("object_posterior") and late.last("robot_description"), 10.0)
     posterior = node.last("object_posterior")
     predicted = node.last("predicted_poses")
+    markers = {m.ns for _, message in node.heard[f"{NODE}/markers"] for m in message.markers}
+    largest = max(len(serialize_message(m)) for _, m in node.heard[f"{NODE}/markers"]) if markers else 0
+    description = node.last("robot_description")
+    states = node.last("joint_states")
+    planned = plans(node, posterior)
+    saved = node.call("save_model", SaveModel, path=model)
+    reset = node.call("reset", Trigger)
+    node.spin(0.5)
+    forgotten = windows()
+    missing = node.call("load_model", LoadModel, path="/nowhere/model.json")
+    loaded = node.call("load_model", LoadModel, path=model)
+    player.play(until=1.5)
+    node.wait(lambda: windows() > 0, 5.0)
     edges = {
         edge.child: {name: interval(getattr(edge, name)) for name in ("damping", "friction", "joint_inertia")}
         for edge in posterior.edges
         if edge.probability > 0.5
     }
-    states = node.last("joint_states")
     return {
         "state": state,
         "prior": None if prior is None else {"parts": len(prior.parts), "edges": len(prior.edges)},
         "settled": settled,
-        "windows": windows(),
+        "windows": posterior.windows_learned,
         "joints": joints(posterior),
         "edges": edges,
         "predicted": {
@@ -229,8 +277,19 @@ def live(bag, settle="60"):
             "frame": predicted.header.frame_id if predicted else None,
         },
         "criticism": node.last("criticism") is not None,
-        "markers": sorted({m.ns for m in node.last("markers").markers}) if node.last("markers") else [],
-        "description": node.last("robot_description").data if node.last("robot_description") else None,
+        "markers": sorted(markers),
+        "largest_markers": largest,
+        "description": description.data if description else None,
+        "planned": planned,
+        "model": {
+            "saved": [saved.success, saved.message],
+            "reset": reset.success,
+            "forgotten": forgotten,
+            "missing": [missing.success, missing.message],
+            "loaded": [loaded.success, loaded.message],
+            "windows": windows(),
+            "joints": joints(node.last("object_posterior")),
+        },
         "joint_states": dict(zip(states.name, states.position)) if states else None,
         "diagnostics": status(node.last("diagnostics")),
         "late": {
