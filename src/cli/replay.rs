@@ -163,11 +163,11 @@ impl Outputs {
         }
         if let Some(mut file) = self.model {
             let name = file.path().display().to_string();
-            let Some(object) = replay.pipeline.saved() else {
+            let Some(snapshot) = replay.pipeline.snapshot() else {
                 bail!("{name}: no interaction was seen: there is nothing to save");
             };
             replay.learned_bags.push(std::mem::take(&mut replay.hash).finish());
-            write_model(&mut file, &replay.learned_bags, &object).context(name)?;
+            write_model(&mut file, &replay.learned_bags, &snapshot.saved()).context(name)?;
             file.finish()?;
         }
         self.recording.map(Recording::finish).transpose()?;

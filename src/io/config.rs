@@ -82,6 +82,7 @@ impl Config {
         PipelineSettings {
             root,
             use_tool: self.observations.tool_pose,
+            points_per_part: self.input.points_per_part,
             windows: self.windows,
             kinematics: self.kinematics,
             gravity_in_world: self.gravity_m_s2.into(),
@@ -203,6 +204,8 @@ pub struct InputConfig {
     pub label_field: String,
     /// Labels that are no part (background): their points are left out.
     pub ignored_labels: Vec<Label>,
+    /// Points of a part that are used of a frame at most; 0: all.
+    pub points_per_part: usize,
     /// How far back moving transforms are kept \[s\].
     pub tf_history_s: f64,
     /// How far the stream may go on before a message that waits for its transform is dropped \[s\].
@@ -223,6 +226,7 @@ impl Default for InputConfig {
             fixed_frame: "world".into(),
             label_field: "label".into(),
             ignored_labels: Vec::new(),
+            points_per_part: 2500,
             tf_history_s: 10.0,
             tf_timeout_s: 1.0,
             default_pose_std: PoseStd::default(),

@@ -115,12 +115,12 @@ impl Ingest {
         inputs
     }
 
-    /// The messages that wait for a transform: of each topic the first one's frame and what is missing.
-    pub fn waiting(&self) -> Vec<(String, LookupError)> {
+    /// The messages that wait for a transform: of each topic the first one's stamp and what is missing.
+    pub fn waiting(&self) -> Vec<(String, Stamp, LookupError)> {
         let first = |(name, topic): (&String, &Topic)| {
             let waiting = topic.waiting.front()?;
             let looked_up = self.transforms.lookup(&self.config.fixed_frame, &waiting.frame, waiting.stamp);
-            Some((name.clone(), looked_up.err()?))
+            Some((name.clone(), waiting.stamp, looked_up.err()?))
         };
         self.topics.iter().filter_map(first).collect()
     }

@@ -134,9 +134,19 @@ fn tracking_values(health: &Health) -> Vec<KeyValue> {
         values.push(value(format!("{name}, max [ms]"), milliseconds(longest)));
         values.push(value(format!("{name}, count"), times.count()));
     }
+    if let Some(bytes) = resident_bytes() {
+        values.push(value("memory [MB]", bytes / 1_000_000));
+    }
     values.extend(health.sent.iter().map(|(topic, count)| value(format!("{topic} sent"), count)));
     values.extend(health.unsent.iter().map(|(reason, count)| value(format!("not sent: {reason}"), count)));
     values
+}
+
+/// Memory that the node holds; `None` where the system does not tell.
+fn resident_bytes() -> Option<u64> {
+    let statm = std::fs::read_to_string("/proc/self/statm").ok()?;
+    let pages: u64 = statm.split_whitespace().nth(1)?.parse().ok()?;
+    Some(pages * rustix::param::page_size() as u64)
 }
 
 fn inference_values(health: &Health) -> Vec<KeyValue> {

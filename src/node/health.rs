@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use super::inbox::Dropped;
 use super::lifecycle::State;
 use crate::io::counters::{ByReason, Counters};
+use crate::types::Stamp;
 
 /// Times kept for quantiles.
 const TIMES_KEPT: usize = 2000;
@@ -111,8 +112,8 @@ pub struct Health {
     pub queued: (usize, usize),
     /// Clouds dropped for newer ones, readings dropped for want of room.
     pub dropped: (Dropped, Dropped),
-    /// Topics that wait for a transform: since when, and what is missing.
-    pub no_tf: BTreeMap<String, (Instant, String)>,
+    /// Topics that wait for a transform: since when, the first message's stamp, and what is missing.
+    pub no_tf: BTreeMap<String, (Instant, Stamp, String)>,
     /// From a cloud's arrival to its predictions being sent \[s\].
     pub latency: Times,
     /// From taking a cloud to its predictions being ready \[s\].
@@ -215,7 +216,7 @@ impl Health {
         if self.state == State::Active {
             self.complain_of_topics(at, limits, &mut found);
         }
-        for (topic, (since, missing)) in &self.no_tf {
+        for (topic, (since, _, missing)) in &self.no_tf {
             if at.duration_since(*since) > TF_PATIENCE {
                 found.insert(format!("tf {topic}"), format!("{topic} waits for its transform: {missing}"));
             }
@@ -322,7 +323,7 @@ mod tests {
             health.listen(topic, kind);
             health.received(topic, past);
         }
-        health.no_tf.insert("/points".into(), (past, "frame `cam` is unknown".into()));
+        health.no_tf.insert("/points".into(), (past, Stamp(0), "frame `cam` is unknown".into()));
         health.incompatible.insert("/wrench".into(), "publisher is best effort".into());
         health.clock = Some(past);
         health.counters.clouds_dropped.insert("unknown_frame".into(), 3);

@@ -7,6 +7,7 @@
 pub mod announce;
 pub mod arguments;
 pub mod diagnostics;
+pub mod drawing;
 pub mod health;
 pub mod inbox;
 pub mod learning;
@@ -14,6 +15,7 @@ pub mod lifecycle;
 pub mod names;
 pub mod parameters;
 pub mod participant;
+pub mod planning;
 pub mod publications;
 pub mod rosout;
 pub mod services;
@@ -22,6 +24,7 @@ pub mod subscriptions;
 pub mod value;
 
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 
 use anyhow::Context as _;
@@ -34,6 +37,7 @@ use tracing::{info, warn};
 
 use arguments::RosArguments;
 use health::SharedHealth;
+use drawing::Drawing;
 use inbox::Inbox;
 use learning::Learning;
 use names::Names;
@@ -90,7 +94,10 @@ async fn live(names: &Names, parameters: Parameters, unusable: Vec<String>, roso
     let threads = parameters.number("worker_threads") as usize;
     let learning =
         Learning::start(threads, health.clone(), move |life, learned| adopt.tell(Command::Adopt(life, learned)))?;
-    let stream = Stream::new(Arc::clone(&inbox), learning, outputs.clone(), health.clone(), input.clone());
+    let meshes = parameters.get("mesh_folder").and_then(value::Value::as_text).filter(|folder| !folder.is_empty());
+    let drawing = Drawing::start(outputs.clone(), meshes.map(PathBuf::from))?;
+    let stream =
+        Stream::new(Arc::clone(&inbox), learning, (outputs.clone(), drawing), health.clone(), input.clone());
     let thread = std::thread::Builder::new().name("stream".into()).spawn(|| stream.run()).context("the stream's thread")?;
     let mut subscriptions =
         Subscriptions::new(&mut participant, &parameters, &input, Arc::clone(&inbox), health.clone())?;

@@ -109,21 +109,13 @@ impl Parameters {
              "A warning says when clouds come more slowly than this [Hz]."),
             ("wrench_timeout_s", Value::Double(0.3), Some((0.01, 60.0)), Change::Always,
              "A warning says when a wrench topic has been silent for this long [s]."),
+            ("mesh_folder", Value::String(String::new()), None, Change::AtStart,
+             "Folder, an absolute path, that the meshes of ~/robot_description are written to; empty: parts are boxes."),
             ("worker_threads", Value::Integer(0), Some((0.0, 1024.0)), Change::AtStart,
              "Threads that inference may use; 0: all cores but one."),
         ];
         for (name, value, range, change, text) in own {
             declared.insert(name.to_owned(), Declaration::new(text, value, range, change));
-        }
-        for (topic, reads, reliable, depth) in QOS_TOPICS {
-            let prefix = qos_prefix(topic, reads);
-            let reliability = if reliable { "reliable" } else { "best_effort" };
-            let text = "QoS: reliable or best_effort.";
-            let value = Value::String(reliability.to_owned());
-            declared.insert(format!("{prefix}.reliability"), Declaration::new(text, value, None, Change::AtStart));
-            let text = "QoS: how many messages are kept.";
-            let declaration = Declaration::new(text, Value::Integer(depth), Some((1.0, 100_000.0)), Change::AtStart);
-            declared.insert(format!("{prefix}.depth"), declaration);
         }
         Self { declared }
     }
@@ -136,11 +128,12 @@ impl Parameters {
             if !bare && !names.matched_by(node) {
                 continue;
             }
-            let Some(declaration) = self.declared.get(name) else {
+            let known = self.declared.get(name).cloned().or_else(|| quality_declaration(name));
+            let Some(declaration) = known else {
                 unusable.push(format!("unknown parameter `{name}` ({source})"));
                 continue;
             };
-            match checked(name, declaration, value).and_then(|value| self.with(name, value)) {
+            match checked(name, &declaration, value).and_then(|value| self.with(name, Declaration { value, ..declaration })) {
                 Ok(changed) => *self = changed,
                 Err(reason) => unusable.push(format!("{reason} ({source})")),
             }
@@ -161,7 +154,10 @@ impl Parameters {
                 Change::Unconfigured if !unconfigured => {
                     return Err(format!("`{name}` can be set only while the node is unconfigured: clean it up first"));
                 }
-                _ => changed = changed.with(name, checked(name, declaration, value)?)?,
+                _ => {
+                    let value = checked(name, declaration, value)?;
+                    changed = changed.with(name, Declaration { value, ..declaration.clone() })?;
+                }
             }
         }
         *self = changed;
@@ -169,11 +165,9 @@ impl Parameters {
     }
 
     /// With one value changed, if a configuration comes of it.
-    fn with(&self, name: &str, value: Value) -> Result<Self, String> {
+    fn with(&self, name: &str, declaration: Declaration) -> Result<Self, String> {
         let mut changed = self.clone();
-        if let Some(declaration) = changed.declared.get_mut(name) {
-            declaration.value = value;
-        }
+        changed.declared.insert(name.to_owned(), declaration);
         changed.config()?;
         Ok(changed)
     }
@@ -212,8 +206,12 @@ impl Parameters {
     /// Whether a topic's QoS is reliable, and how many are kept.
     pub fn qos(&self, topic: &str, reads: bool) -> (bool, i32) {
         let prefix = qos_prefix(topic, reads);
-        let reliable = self.get(&format!("{prefix}.reliability")).and_then(Value::as_text);
-        let depth = self.number(&format!("{prefix}.depth"));
+        let value = |policy: &str| {
+            let name = format!("{prefix}.{policy}");
+            self.get(&name).cloned().or_else(|| quality_declaration(&name).map(|declaration| declaration.value))
+        };
+        let reliable = value("reliability").and_then(|value| value.as_text());
+        let depth = value("depth").and_then(|value| value.as_integer()).unwrap_or(1);
         (reliable.as_deref() == Some("reliable"), depth as i32)
     }
 
@@ -231,11 +229,10 @@ impl Parameters {
         insert(&mut top, "input.wrenches", self.wrenches()?);
         let text = serde_yaml_ng::to_string(&top).map_err(|error| error.to_string())?;
         let config = Config::parse(&text, Path::new("parameters")).map_err(|error| error.to_string())?;
-        for (topic, reads, ..) in QOS_TOPICS {
-            let key = format!("{}.reliability", qos_prefix(topic, reads));
-            let value = self.get(&key).and_then(Value::as_text).unwrap_or_default();
+        for (name, declaration) in self.declared.iter().filter(|(name, _)| name.ends_with(".reliability")) {
+            let value = declaration.value.as_text().unwrap_or_default();
             if !["reliable", "best_effort"].contains(&value.as_str()) {
-                return Err(format!("`{key}`: `{value}`, expected reliable or best_effort"));
+                return Err(format!("`{name}`: `{value}`, expected reliable or best_effort"));
             }
         }
         Ok(config)
@@ -299,6 +296,24 @@ fn qos_prefix(topic: &str, reads: bool) -> String {
     format!("qos_overrides.{}.{side}", topic.trim_start_matches("~/").trim_start_matches('/'))
 }
 
+/// A QoS parameter of one of the topics that have them. They are declared once they are given: all of
+/// them would make the list of parameters too long for one datagram, and RustDDS 0.15.1 writes fragments of
+/// an answer that Fast DDS does not read.
+fn quality_declaration(name: &str) -> Option<Declaration> {
+    QOS_TOPICS.into_iter().find_map(|(topic, reads, reliable, depth)| {
+        let policy = name.strip_prefix(&qos_prefix(topic, reads))?;
+        let (text, value, range) = match policy {
+            ".reliability" => {
+                let reliability = if reliable { "reliable" } else { "best_effort" };
+                ("QoS: reliable or best_effort.", Value::String(reliability.to_owned()), None)
+            }
+            ".depth" => ("QoS: how many messages are kept.", Value::Integer(depth), Some((1.0, 100_000.0))),
+            _ => return None,
+        };
+        Some(Declaration::new(text, value, range, Change::AtStart))
+    })
+}
+
 /// The value that a parameter takes, in its own type.
 fn checked(name: &str, declaration: &Declaration, value: &Value) -> Result<Value, String> {
     let value = value.in_type_of(&declaration.value).ok_or_else(|| {
@@ -315,7 +330,7 @@ fn checked(name: &str, declaration: &Declaration, value: &Value) -> Result<Value
 fn is_of_config(name: &str) -> bool {
     let live = ["root_label", "use_sim_time", "autostart", "publish_tf", "slowest_clouds_hz", "wrench_timeout_s"];
     !live.contains(&name)
-        && name != "worker_threads"
+        && !["worker_threads", "mesh_folder"].contains(&name)
         && !name.starts_with("qos_overrides.")
         && !name.starts_with("input.wrenches.")
 }

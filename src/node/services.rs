@@ -1,9 +1,11 @@
 //! Services: parameters as rcl has them, the lifecycle as its managers expect it, and the node's own.
 
 use std::future::Future;
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::SystemTime;
 
+use anyhow::Context as _;
 use ros2_client::Server;
 use ros2_interfaces_jazzy_serde::lifecycle_msgs::{
     msg::{Transition as TransitionMessage, TransitionEvent},
@@ -28,12 +30,18 @@ use tracing::{info, warn};
 use super::health::SharedHealth;
 use super::inbox::Inbox;
 use super::lifecycle::{State, Transition};
+use super::planning;
 use super::parameters::Parameters;
 use super::participant::{Participant, Wire};
 use super::publications::{Outputs, Publication};
 use super::stream::Command;
 use super::value::Value;
 use crate::io::config::InputConfig;
+use crate::io::model_file::{SavedModel, write_model};
+use crate::io::output_file::OutputFile;
+use crate::ros::messages::{
+    self, LoadModelRequest, LoadModelResponse, PredictRequest, PredictResponse, SaveModelRequest, SaveModelResponse,
+};
 
 /// What services ask and change; cheap to share.
 #[derive(Clone)]
@@ -101,6 +109,40 @@ impl Managed {
         Ok(goal)
     }
 
+    /// Where the parts would be under a planned wrench.
+    async fn predict(&self, request: PredictRequest) -> PredictResponse {
+        let answered = async {
+            let (reply, ground) = oneshot::channel();
+            self.inbox.tell(Command::Planner(request.header.frame_id.clone(), reply));
+            let ground = ground.await.context("the node is shutting down")?.map_err(anyhow::Error::msg)?;
+            tokio::task::spawn_blocking(move || planning::answer(&ground, &request)).await?
+        };
+        let answered: anyhow::Result<PredictResponse> = answered.await;
+        answered.unwrap_or_else(|error| PredictResponse { message: format!("{error:#}"), ..PredictResponse::default() })
+    }
+
+    /// Writes what was learned, while the stream goes on.
+    async fn save(&self, path: PathBuf) -> anyhow::Result<()> {
+        let (reply, snapshot) = oneshot::channel();
+        self.inbox.tell(Command::Snapshot(reply));
+        let (snapshot, bags) =
+            snapshot.await.context("the node is shutting down")?.context("no interaction was seen: nothing to save")?;
+        tokio::task::spawn_blocking(move || {
+            let mut file = OutputFile::create(&path)?;
+            write_model(&mut file, &bags, &snapshot.saved()).with_context(|| path.display().to_string())?;
+            file.finish().map_err(anyhow::Error::from)
+        })
+        .await?
+    }
+
+    /// Reads what was learned before, and goes on from there.
+    async fn load(&self, path: PathBuf) -> anyhow::Result<()> {
+        let model = tokio::task::spawn_blocking(move || SavedModel::from_file(&path)).await??;
+        let (reply, outcome) = oneshot::channel();
+        self.inbox.tell(Command::Resume(Box::new(model), reply));
+        outcome.await.context("the node is shutting down")?.map_err(anyhow::Error::msg)
+    }
+
     fn set(&self, parameters: &[Parameter]) -> SetParametersResult {
         let settings: Vec<(String, Value)> =
             parameters.iter().map(|parameter| (parameter.name.clone(), Value::from(&parameter.value))).collect();
@@ -130,9 +172,12 @@ impl Managed {
             rest.is_some_and(|rest| depth == 0 || (rest.matches('.').count() as u64) < depth)
         };
         let names: Vec<String> = parameters.names().filter(wanted).map(str::to_owned).collect();
-        let mut above: Vec<String> =
-            names.iter().filter_map(|name| name.rsplit_once('.')).map(|(prefix, _)| prefix.to_owned()).collect();
-        above.sort();
+        let mut above: Vec<String> = names
+            .iter()
+            .filter(|_| depth > 0)
+            .filter_map(|name| name.rsplit_once('.'))
+            .map(|(prefix, _)| prefix.to_owned())
+            .collect();
         above.dedup();
         ListParametersResult { names, prefixes: above }
     }
@@ -194,6 +239,37 @@ pub fn serve(participant: &mut Participant, managed: &Managed) -> anyhow::Result
             let success = waiting.await.is_ok();
             let message = if success { "what was learned is forgotten" } else { "the node is shutting down" };
             TriggerResponse { success, message: message.to_owned() }
+        }
+    });
+    let own = managed.clone();
+    let type_name = format!("{}/srv/Predict", messages::PACKAGE);
+    let server = participant.serve::<PredictRequest, PredictResponse>("~/predict", &type_name)?;
+    answer(server, move |request: PredictRequest| {
+        let own = own.clone();
+        async move { own.predict(request).await }
+    });
+    let own = managed.clone();
+    let type_name = format!("{}/srv/SaveModel", messages::PACKAGE);
+    let server = participant.serve::<SaveModelRequest, SaveModelResponse>("~/save_model", &type_name)?;
+    answer(server, move |request: SaveModelRequest| {
+        let own = own.clone();
+        async move {
+            match own.save(PathBuf::from(&request.path)).await {
+                Ok(()) => SaveModelResponse { success: true, message: format!("saved to {}", request.path) },
+                Err(error) => SaveModelResponse { success: false, message: format!("{error:#}") },
+            }
+        }
+    });
+    let own = managed.clone();
+    let type_name = format!("{}/srv/LoadModel", messages::PACKAGE);
+    let server = participant.serve::<LoadModelRequest, LoadModelResponse>("~/load_model", &type_name)?;
+    answer(server, move |request: LoadModelRequest| {
+        let own = own.clone();
+        async move {
+            match own.load(PathBuf::from(&request.path)).await {
+                Ok(()) => LoadModelResponse { success: true, message: format!("goes on from {}", request.path) },
+                Err(error) => LoadModelResponse { success: false, message: format!("{error:#}") },
+            }
         }
     });
     Ok(())

@@ -6,19 +6,23 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use nalgebra::Vector3;
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 
 use super::announce::Announcer;
+use super::drawing::Drawing;
 use super::health::{SharedHealth, now};
 use super::inbox::{Arrival, Inbox};
 use super::learning::Learning;
 use super::publications::Outputs;
 use crate::io::config::InputConfig;
 use crate::io::ingest::{Ingest, Message};
-use crate::pipeline::{Learned, Output, Pipeline, PipelineSettings};
+use crate::io::model_file::SavedModel;
+use crate::math::Pose;
+use crate::pipeline::{Learned, Output, Pipeline, PipelineSettings, Planner, Snapshot};
 use crate::ros::PartPrediction;
-use crate::types::{Input, Stamp};
+use crate::types::{Input, Label, Stamp};
 
 /// How long the thread sleeps where nothing comes.
 const PATIENCE: Duration = Duration::from_millis(200);
@@ -28,7 +32,6 @@ const REPORT_EVERY: Duration = Duration::from_millis(100);
 const JUMP_S: f64 = 1.0;
 
 /// What the stream can be told.
-#[derive(Debug)]
 pub enum Command {
     /// Begin with nothing learned, by these settings; passing over what comes.
     Configure(Box<(InputConfig, PipelineSettings)>),
@@ -40,6 +43,13 @@ pub enum Command {
     Deactivate,
     /// Forget what was learned and go on.
     Reset(oneshot::Sender<()>),
+    /// What was learned, for saving, with the bags that it knows; `None` where there is nothing yet.
+    Snapshot(oneshot::Sender<Option<(Snapshot, Vec<String>)>>),
+    /// Go on from what was learned before; whether that is possible.
+    Resume(Box<SavedModel>, oneshot::Sender<Result<(), String>>),
+    /// What plans are answered from, with the transform from this frame into the fixed one, the stamp of
+    /// now and the parts' centres.
+    Planner(String, oneshot::Sender<Result<Box<Ground>, String>>),
     /// A window was learned in this life of the pipeline.
     Adopt(u64, Box<Learned>),
     /// The clock went back.
@@ -50,17 +60,32 @@ pub enum Command {
     Stop,
 }
 
+/// What a plan is answered from.
+pub struct Ground {
+    /// The stream's knowledge.
+    pub planner: Planner,
+    /// From the plan's frame.
+    pub world_from_frame: Pose,
+    /// Now.
+    pub stamp: Stamp,
+    /// Name of the fixed frame.
+    pub fixed_frame: String,
+    /// Centres of mass of the parts at the first frame \[m\].
+    pub centers: BTreeMap<Label, Vector3<f64>>,
+}
+
 /// The state of the stream.
 pub struct Stream {
     inbox: Arc<Inbox<Command>>,
     learning: Learning,
-    outputs: Outputs,
     health: SharedHealth,
     ingest: Ingest,
     input: InputConfig,
     settings: Option<PipelineSettings>,
     pipeline: Option<Pipeline>,
     announcer: Announcer,
+    /// Bags that a loaded model has learned.
+    bags: Vec<String>,
     active: bool,
     /// Counts the pipelines, so that what an older one handed out is not adopted by a newer.
     life: u64,
@@ -79,20 +104,20 @@ impl Stream {
     pub fn new(
         inbox: Arc<Inbox<Command>>,
         learning: Learning,
-        outputs: Outputs,
+        (outputs, drawing): (Outputs, Drawing),
         health: SharedHealth,
         input: InputConfig,
     ) -> Self {
         Self {
             inbox,
             learning,
-            announcer: Announcer::new(outputs.clone(), input.fixed_frame.clone()),
-            outputs,
+            announcer: Announcer::new(outputs, drawing, input.fixed_frame.clone()),
             health,
             ingest: Ingest::new(&input),
             input,
             settings: None,
             pipeline: None,
+            bags: Vec::new(),
             active: false,
             life: 0,
             shift_ns: 0,
@@ -130,7 +155,6 @@ impl Stream {
             Command::Configure(settings) => {
                 let (input, settings) = *settings;
                 self.ingest = self.ingest.anew(&input);
-                self.announcer = Announcer::new(self.outputs.clone(), input.fixed_frame.clone());
                 self.input = input;
                 self.settings = Some(settings);
                 self.begin();
@@ -152,6 +176,16 @@ impl Stream {
                 // Whoever asked may be gone.
                 let _ = done.send(());
             }
+            Command::Snapshot(reply) => {
+                let snapshot = self.pipeline.as_ref().and_then(Pipeline::snapshot);
+                let _ = reply.send(snapshot.map(|snapshot| (snapshot, self.bags.clone())));
+            }
+            Command::Planner(frame, reply) => {
+                let _ = reply.send(self.ground(&frame));
+            }
+            Command::Resume(model, reply) => {
+                let _ = reply.send(self.resume(*model));
+            }
             Command::Adopt(life, learned) if life == self.life => {
                 if let Some(pipeline) = &mut self.pipeline {
                     pipeline.adopt(&learned);
@@ -165,18 +199,43 @@ impl Stream {
         }
     }
 
+    fn ground(&self, frame: &str) -> Result<Box<Ground>, String> {
+        let pipeline = self.pipeline.as_ref().ok_or("the node is unconfigured")?;
+        let planner = pipeline.planner().ok_or("no joint is known yet")?;
+        let zero = pipeline.zero().unwrap_or_default();
+        let stamp = Stamp(zero.plus_seconds(planner.time_s()).0 - self.shift_ns);
+        let fixed_frame = self.input.fixed_frame.clone();
+        let frame = if frame.is_empty() { &fixed_frame } else { frame };
+        let world_from_frame =
+            self.ingest.transforms().lookup(&fixed_frame, frame, stamp).map_err(|error| error.to_string())?;
+        let centers = self.announcer.centers();
+        Ok(Box::new(Ground { planner, world_from_frame, stamp, fixed_frame, centers }))
+    }
+
+    /// A pipeline that goes on from a saved model.
+    fn resume(&mut self, model: SavedModel) -> Result<(), String> {
+        let settings = self.settings.clone().ok_or("the node is unconfigured: configure it first")?;
+        let root = model.object.root();
+        let pipeline = Pipeline::resume(settings, model.object).map_err(|error| error.to_string())?;
+        self.begin();
+        self.announcer.prior(Some(root), self.ingest.counters());
+        (self.pipeline, self.bags) = (Some(pipeline), model.bags);
+        Ok(())
+    }
+
     /// A new pipeline, if there are settings for one.
     fn begin(&mut self) {
         self.life += 1;
         self.learning.clear();
         self.pipeline = self.settings.clone().map(Pipeline::new);
         (self.shift_ns, self.newest, self.begin_again) = (0, None, false);
+        self.bags.clear();
         self.newest_of_camera.clear();
         self.arrivals.clear();
         self.ingest.begin_again();
-        self.announcer.begin();
+        self.announcer.begin(&self.input.fixed_frame);
         if let Some(settings) = &self.settings {
-            self.announcer.prior(None, settings.root, self.ingest.counters());
+            self.announcer.prior(settings.root, self.ingest.counters());
         }
     }
 
@@ -263,6 +322,10 @@ impl Stream {
                 }
                 Output::Resumed { root, unexplained, unknown } => {
                     info!(%root, "goes on with a saved object");
+                    if let Some(pipeline) = &self.pipeline {
+                        let stamp = self.newest.map_or(zero, |newest| Stamp(newest.0 - self.shift_ns));
+                        self.announcer.resumed(pipeline, stamp, self.ingest.counters(), self.shift_ns);
+                    }
                     for label in unexplained {
                         warn!(%label, "part is not where its joint could have it");
                     }
@@ -289,15 +352,16 @@ impl Stream {
         }
         self.reported = at;
         let (readings, clouds, superseded, overflown) = self.inbox.state();
-        let missing: BTreeMap<String, String> =
-            self.ingest.waiting().into_iter().map(|(topic, error)| (topic, error.to_string())).collect();
+        let missing = self.ingest.waiting();
         let mut health = self.health.lock();
         health.counters = self.ingest.counters().clone();
         health.queued = (readings, clouds);
         health.dropped = (superseded, overflown);
-        health.no_tf.retain(|topic, _| missing.contains_key(topic));
-        for (topic, text) in missing {
-            health.no_tf.entry(topic).or_insert((at, String::new())).1 = text;
+        // A message that waits is looked at as long as it is the same one.
+        let is_there = |topic: &String, stamp: Stamp| missing.iter().any(|(t, s, _)| t == topic && *s == stamp);
+        health.no_tf.retain(|topic, (_, stamp, _)| is_there(topic, *stamp));
+        for (topic, stamp, error) in &missing {
+            health.no_tf.entry(topic.clone()).or_insert((at, *stamp, String::new())).2 = error.to_string();
         }
     }
 }

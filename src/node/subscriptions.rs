@@ -1,7 +1,6 @@
 //! What the node listens to: a task for each topic, always draining into the inbox.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fmt;
 use std::sync::Arc;
 
 use futures::{StreamExt, pin_mut};
@@ -97,7 +96,7 @@ pub struct Subscriptions<C> {
     pub names: BTreeMap<rustdds::GUID, String>,
 }
 
-impl<C: fmt::Debug + Send + 'static> Subscriptions<C> {
+impl<C: Send + 'static> Subscriptions<C> {
     /// Listens to the topics of the configuration, absolute names; poses as they appear.
     ///
     /// # Errors

@@ -267,6 +267,11 @@ impl Forecaster {
         outputs
     }
 
+    /// What is known now: the joints, the parts by themselves, the last frame. `None` without a joint.
+    pub fn knowledge(&self) -> Option<(Filter, BTreeMap<Label, FreePart>, Frame)> {
+        Some((self.filter.clone()?, self.free_parts(), self.seen.back()?.frame.clone()))
+    }
+
     /// The rest, at the end of the stream.
     pub fn finish(&mut self) -> Vec<Output> {
         self.ready(|_| true)

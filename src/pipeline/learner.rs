@@ -173,6 +173,17 @@ impl Learner {
         self.fit.as_ref().map_or(&[], |fit| &fit.joints)
     }
 
+    /// Least and greatest position of each joint of the likeliest tree in the windows learned, by child
+    /// \[m or rad\].
+    pub fn ranges_seen(&self) -> BTreeMap<Label, (f64, f64)> {
+        let Some(fit) = &self.fit else { return BTreeMap::new() };
+        let range = |joint: usize| {
+            let seen = fit.positions.iter().filter_map(|window| window.get(joint)).flatten().copied();
+            seen.fold((0.0, 0.0), |(least, greatest): (f64, f64), q| (least.min(q), greatest.max(q)))
+        };
+        fit.joints.iter().enumerate().map(|(index, joint)| (joint.child, range(index))).collect()
+    }
+
     /// Sets the baselines that are not known yet from frames at the reference configuration.
     pub fn calibrate(&mut self, frames: &[Frame]) {
         for (label, model) in &self.models {

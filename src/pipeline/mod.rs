@@ -5,6 +5,7 @@ mod explain;
 mod forecast;
 mod keyframes;
 mod learner;
+mod planning;
 mod posterior;
 mod retention;
 mod saved;
@@ -20,7 +21,8 @@ use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 pub use evaluate::{PartScore, Scores};
 pub use explain::Frame;
 pub use learner::{Learner, ParentEvidence, WindowJob};
-pub use saved::{ResumeError, SavedObject, SavedObjectRef};
+pub use planning::Planner;
+pub use saved::{ResumeError, SavedObject, SavedObjectRef, Snapshot};
 pub use windows::{FrameAssembler, WindowCutter, WindowSettings};
 pub use worker::{ClosedWindow, Learned, Worker};
 
@@ -47,6 +49,8 @@ pub struct PipelineSettings {
     pub root: Option<Label>,
     /// Whether the tool's position is an observation of the part it holds.
     pub use_tool: bool,
+    /// Points of a part that are used of a frame at most; 0: all.
+    pub points_per_part: usize,
     /// When windows open and close.
     pub windows: WindowSettings,
     /// What is assumed of the pose measurements.
@@ -227,7 +231,7 @@ impl Pipeline {
                 cutter.push_wrench(wrench);
             }
         }
-        let frame = frame_of(stamp.seconds_since(zero), clouds);
+        let frame = frame_of(stamp.seconds_since(zero), clouds, self.settings.points_per_part);
         let mut outputs: Vec<Output> = self.take_up(&frame, zero).into_iter().collect();
         outputs.extend(self.observe(&frame));
         let moving = self.moving;

@@ -28,22 +28,30 @@ impl Pipeline {
         if let Some(learner) = &self.learner {
             return Some(learner.posterior());
         }
-        let mut points: BTreeMap<Label, Vec<Vector3<f64>>> = BTreeMap::new();
-        let last = self.reference.last().into_iter().flat_map(|frame| &frame.scans);
-        for (label, scan) in last {
-            points.entry(*label).or_default().extend(scan.iter().map(|p| p.point_in_world));
-        }
+        let points = self.surfaces_in_work();
         let likeliest = || points.iter().max_by_key(|(_, points)| points.len()).map(|(label, _)| *label);
         Some(posterior(self.settings.root.or_else(likeliest)?, &points, None))
+    }
+
+    /// Points of each part's surface at the reference configuration, in the working frame \[m\].
+    pub(super) fn surfaces_in_work(&self) -> BTreeMap<Label, Vec<Vector3<f64>>> {
+        if let Some(learner) = &self.learner {
+            return learner.surfaces();
+        }
+        let last = self.reference.last().into_iter().flat_map(|frame| &frame.scans);
+        last.map(|(label, scan)| (*label, scan.iter().map(|p| p.point_in_world).collect())).collect()
     }
 }
 
 impl Learner {
     /// What is believed by what was learned.
     pub(super) fn posterior(&self) -> ObjectPosterior {
+        posterior(self.root, &self.surfaces(), Some(self))
+    }
+
+    pub(super) fn surfaces(&self) -> BTreeMap<Label, Vec<Vector3<f64>>> {
         let surface = |model: &PartModel| model.surfels.iter().map(|s| s.point).collect();
-        let points = self.models.iter().map(|(label, model)| (*label, surface(model))).collect();
-        posterior(self.root, &points, Some(self))
+        self.models.iter().map(|(label, model)| (*label, surface(model))).collect()
     }
 }
 

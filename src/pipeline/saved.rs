@@ -29,6 +29,31 @@ const LEAVES: f64 = 0.02;
 /// A second.
 const SECOND_NS: i64 = 1_000_000_000;
 
+/// What was learned by a time, to be saved while the stream goes on.
+#[derive(Clone)]
+pub struct Snapshot {
+    world_from_work: Pose,
+    gravity_in_world: Vector3<f64>,
+    zero: Stamp,
+    newest: Stamp,
+    learner: Arc<Learner>,
+}
+
+impl Snapshot {
+    /// What is written of it.
+    pub fn saved(&self) -> SavedObjectRef<'_> {
+        let grown = |model: &PartModel| model.surfels.iter().filter(|surfel| surfel.grown).copied().collect();
+        SavedObjectRef {
+            world_from_work: self.world_from_work,
+            gravity_in_world: self.gravity_in_world,
+            zero: self.zero,
+            newest: self.newest,
+            grown: self.learner.models.iter().map(|(label, model)| (*label, grown(model))).collect(),
+            learner: &self.learner,
+        }
+    }
+}
+
 /// What is saved, as it is written.
 #[derive(Debug, Serialize)]
 pub struct SavedObjectRef<'a> {
@@ -94,17 +119,14 @@ impl SavedObject {
 
 impl Pipeline {
     /// What was learned, for saving; `None` before the first window.
-    pub fn saved(&self) -> Option<SavedObjectRef<'_>> {
+    pub fn snapshot(&self) -> Option<Snapshot> {
         let WorkingFrame::Known(world_from_work) = self.working_frame else { return None };
-        let learner = self.learner.as_deref()?;
-        let grown = |model: &PartModel| model.surfels.iter().filter(|surfel| surfel.grown).copied().collect();
-        Some(SavedObjectRef {
+        Some(Snapshot {
             world_from_work,
             gravity_in_world: self.settings.gravity_in_world,
             zero: self.zero?,
             newest: self.newest?,
-            grown: learner.models.iter().map(|(label, model)| (*label, grown(model))).collect(),
-            learner,
+            learner: Arc::clone(self.learner.as_ref()?),
         })
     }
 

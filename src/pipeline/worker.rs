@@ -2,10 +2,14 @@
 //!
 //! Replay learns in the stream, as time stands still there; a live stream does not wait.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use super::working_frame::hulls;
 use super::{Learner, WindowJob};
+use crate::geometry::HullProperties;
 use crate::math::Pose;
+use crate::types::Label;
 use crate::types::posterior::ObjectPosterior;
 
 /// A window that closed, with what a worker needs to learn it.
@@ -57,6 +61,10 @@ pub struct Learned {
     pub span_s: (f64, f64),
     /// What is believed now, in world.
     pub posterior: ObjectPosterior,
+    /// Hulls of the parts, in world at the first frame.
+    pub hulls: BTreeMap<Label, HullProperties>,
+    /// Least and greatest position of each joint of the likeliest tree so far, by child \[m or rad\].
+    pub ranges_seen: BTreeMap<Label, (f64, f64)>,
 }
 
 /// Learns windows one after the other, in the order they closed.
@@ -76,6 +84,8 @@ impl Worker {
             learner: Arc::clone(learner),
             span_s: window.span_s(),
             posterior: learner.posterior().carried_by(&window.world_from_work),
+            hulls: hulls(&learner.surfaces(), &window.world_from_work),
+            ranges_seen: learner.ranges_seen(),
         }
     }
 }

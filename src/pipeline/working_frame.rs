@@ -4,13 +4,16 @@
 //! world's frame would give another posterior. So: z up, origin and x from the first cloud, all
 //! input carried in, all output carried out. Without gravity, z is the cloud's thinnest direction.
 
+use std::collections::BTreeMap;
+
 use nalgebra::{Matrix3, Matrix6, Vector3};
 
-use super::{Output, Pipeline};
+use super::{Learner, Output, Pipeline};
+use crate::geometry::{HullProperties, hull_properties};
 use crate::math::Pose;
 use crate::model::PoseMeasurement;
 use crate::types::posterior::ObjectPosterior;
-use crate::types::{AppliedWrench, Input, LabelledPoint};
+use crate::types::{AppliedWrench, Input, Label, LabelledPoint};
 
 /// Gravity weaker than this says nothing of up \[m/s²\].
 const LEAST_GRAVITY: f64 = 1e-3;
@@ -57,16 +60,39 @@ impl Pipeline {
         Some(self.posterior_in_work()?.carried_by(&self.world_from_work()))
     }
 
+    /// Hulls of the parts as seen so far, in world at the first frame.
+    pub fn hulls(&self) -> BTreeMap<Label, HullProperties> {
+        hulls(&self.surfaces_in_work(), &self.world_from_work())
+    }
+
+    /// Least and greatest position of each joint of the likeliest tree in the windows learned, by child
+    /// \[m or rad\].
+    pub fn ranges_seen(&self) -> BTreeMap<Label, (f64, f64)> {
+        self.learner().map(Learner::ranges_seen).unwrap_or_default()
+    }
+
     pub(super) fn gravity_in_work(&self) -> Vector3<f64> {
         self.world_from_work().rotation.transpose() * self.settings.gravity_in_world
     }
 
-    fn world_from_work(&self) -> Pose {
+    pub(super) fn world_from_work(&self) -> Pose {
         match self.working_frame {
             WorkingFrame::Open(_) => Pose::identity(),
             WorkingFrame::Known(pose) => pose,
         }
     }
+}
+
+/// Hulls of surfaces, carried into world.
+pub(super) fn hulls(
+    surfaces_in_work: &BTreeMap<Label, Vec<Vector3<f64>>>,
+    world_from_work: &Pose,
+) -> BTreeMap<Label, HullProperties> {
+    let in_world = |points: &[Vector3<f64>]| -> Vec<Vector3<f64>> {
+        points.iter().map(|p| world_from_work.transform_point(p)).collect()
+    };
+    let surfaces = surfaces_in_work.iter();
+    surfaces.filter_map(|(label, points)| Some((*label, hull_properties(&in_world(points), None)?))).collect()
 }
 
 /// world_from_work by the first thing seen; wrenches say nothing of it.
@@ -156,7 +182,6 @@ fn turned(information: &Matrix6<f64>, rotation: &Matrix3<f64>) -> Matrix6<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::types::Label;
     use nalgebra::UnitQuaternion;
 
     fn points() -> Vec<LabelledPoint> {

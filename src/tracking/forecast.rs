@@ -81,7 +81,7 @@ impl Filter {
     }
 
     /// The joints' path from the present state, some coordinates changed; `None` if it is not finite.
-    fn simulate(
+    pub(super) fn simulate(
         &self,
         changes: &[(usize, f64)],
         times_s: &[f64],

@@ -8,6 +8,7 @@ mod filter;
 mod forecast;
 mod free;
 mod mechanism;
+mod plan;
 mod score;
 mod simulation;
 #[cfg(test)]
@@ -17,4 +18,5 @@ pub use filter::{Filter, Held};
 pub use forecast::Forecast;
 pub use free::FreePart;
 pub use mechanism::{ActiveNumber, TrackedMechanism, TreeFamily};
+pub use plan::{Plan, PlannedPose};
 pub use score::{MeasuredPath, ResidualSum};
