@@ -1,19 +1,19 @@
 //! The posterior as it is published: what the learner knows, over all trees.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use nalgebra::{DMatrix, Matrix3, Vector3};
 
 use super::{Learner, ParentEvidence, Pipeline};
 use crate::geometry::hull_properties;
 use crate::mechanism::JointType;
-use crate::model::{Axis, DynamicsPosterior, JointDynamics, KinematicFit, WindowInference, WindowObservations};
+use crate::model::{Axis, DynamicsPosterior, JointDynamics, KinematicFit};
 use crate::registration::PartModel;
 use crate::structure::TreeDistribution;
 use crate::types::Label;
 use crate::types::posterior::{
     Criticism, EdgePosterior, InformedBy, JointTypeProbabilities, ObjectPosterior, PartPosterior, PrismaticAxis,
-    Quantity, RevoluteAxis, WindowRecord,
+    Quantity, RevoluteAxis,
 };
 
 /// Density of furniture parts over their hull, median \[kg/m³\] and standard deviation of its log:
@@ -76,7 +76,7 @@ fn posterior(
         root_label,
         parts,
         edges: edges(root_label, &labels, known),
-        windows: learner.map(window_records).unwrap_or_default(),
+        windows: learner.map(|learner| learner.records.clone()).unwrap_or_default(),
         criticism: Criticism::insufficient(),
     }
 }
@@ -100,29 +100,6 @@ fn part(label: Label, points: &[Vector3<f64>]) -> Option<PartPosterior> {
 struct Known<'a> {
     learner: &'a Learner,
     dynamics: Option<&'a DynamicsPosterior>,
-}
-
-fn window_records(learner: &Learner) -> Vec<WindowRecord> {
-    // The first windows may have had no joint to infer the dynamics of.
-    let without = learner.windows.len().saturating_sub(learner.inferences.len());
-    let inferences = std::iter::repeat_n(None, without).chain(learner.inferences.iter().map(Some));
-    learner.windows.iter().zip(inferences).map(|(window, inference)| window_record(window, inference)).collect()
-}
-
-fn window_record(window: &WindowObservations, inference: Option<&WindowInference>) -> WindowRecord {
-    let touched: BTreeSet<Label> = window.contacts.iter().map(|contact| contact.label).collect();
-    let end = |time: Option<&f64>| time.copied().unwrap_or_default();
-    let learned = inference.filter(|inference| inference.failure.is_none());
-    WindowRecord {
-        t0_s: end(window.times_s.first()),
-        t1_s: end(window.times_s.last()),
-        labels: touched.into_iter().collect(),
-        frames: window.times_s.len(),
-        steps: inference.map_or(0, |inference| inference.steps),
-        inference_wall_s: 0.0,
-        elbo: learned.map(|inference| inference.elbo),
-        log_predictive_density: learned.map(|inference| inference.log_predictive_density),
-    }
 }
 
 fn edges(root: Label, labels: &[Label], known: Option<Known<'_>>) -> Vec<EdgePosterior> {
