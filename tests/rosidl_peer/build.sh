@@ -1,16 +1,25 @@
 #!/usr/bin/env bash
 # Builds this package's messages, and tf2_msgs, with the real rosidl, in a virtual environment.
 #
-#   tests/rosidl_peer/build.sh [FOLDER]
+#   tests/rosidl_peer/build.sh [--program] [FOLDER]
 #
 # Prints the path of a file to source: with it python3 has rclpy and all message packages, and colcon finds
 # ROS. FOLDER, for the environment and what is built, is $CARGO_TARGET_DIR/ros (target/ros) unless given;
 # BOM_PEER_VENV names an environment to share. Does nothing when nothing has changed; safe to call at the same time.
+# --program: the whole package with colcon, the program by cargo in $CARGO_TARGET_DIR; what is installed is run.
 # Needs Python 3.11 with its headers, g++, make and OpenSSL's headers.
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
 repository=$(cd "$here/../.." && pwd)
-folder=${1:-${CARGO_TARGET_DIR:-$repository/target}/ros}
+program=OFF
+if [ "${1:-}" = --program ]; then
+    program=ON
+    shift
+fi
+target=${CARGO_TARGET_DIR:-$repository/target}
+mkdir -p "$target"
+target=$(cd "$target" && pwd)
+folder=${1:-$target/ros}
 mkdir -p "$folder"
 folder=$(cd "$folder" && pwd)
 venv=${BOM_PEER_VENV:-$folder/venv}
@@ -26,7 +35,7 @@ wanted=$({
     echo "$venv"
     find "${inputs[@]}" -type f -print0 | sort -z | xargs -0 sha256sum
 } | sha256sum)
-if [ -f "$folder/built" ] && [ "$(cat "$folder/built")" = "$wanted" ]; then
+if [ "$program" = OFF ] && [ -f "$folder/built" ] && [ "$(cat "$folder/built")" = "$wanted" ]; then
     echo "$environment"
     exit 0
 fi
@@ -70,10 +79,17 @@ END
     colcon --log-base "$folder/log" build \
         --base-paths "$repository" "$here/tf2_msgs" --packages-select tf2_msgs bayesian_object_models \
         --build-base "$folder/build" --install-base "$folder/install" --event-handlers console_direct- \
-        --cmake-args -DBOM_BUILD_PROGRAM=OFF -DBUILD_TESTING=OFF -DCMAKE_CXX_FLAGS=-O0 -DCMAKE_C_FLAGS=-O0 \
-        "-DPython3_EXECUTABLE=$venv/bin/python" "-DPYTHON_EXECUTABLE=$venv/bin/python" \
-        ${BOM_CMAKE_ARGUMENTS:-}
+        --cmake-args "-DBOM_BUILD_PROGRAM=$program" "-DBOM_CARGO_TARGET_DIR=$target" \
+        -DBUILD_TESTING=OFF -DCMAKE_CXX_FLAGS=-O0 -DCMAKE_C_FLAGS=-O0 \
+        "-DPython3_EXECUTABLE=$venv/bin/python" "-DPYTHON_EXECUTABLE=$venv/bin/python"
 )
 (source "$environment" && python3 -c 'import bayesian_object_models.msg, bayesian_object_models.srv, tf2_msgs.msg')
+if [ "$program" = ON ]; then
+    installed=$folder/install/bayesian_object_models
+    "$installed/lib/bayesian_object_models/bom" --help
+    for file in msg/ObjectPosterior.msg srv/Predict.srv config/default.yaml rviz/bom.rviz foxglove/bom.json; do
+        [ -s "$installed/share/bayesian_object_models/$file" ]
+    done
+fi
 echo "$wanted" >"$folder/built"
 echo "$environment" >&3

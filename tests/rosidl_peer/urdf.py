@@ -6,16 +6,27 @@ poses: for each of the given positions {link: the 4×4 transform from the base l
 
 import json
 import sys
+import urllib.parse
 
 import numpy
 import yourdfpy
+
+
+
+def file_of(fname):
+    """The path of a file URI."""
+    scheme, path = fname[:7], fname[7:]
+    if scheme != "file://":
+        sys.exit(f"{fname}: expected a file URI")
+    return urllib.parse.unquote(path)
+
 
 robot = yourdfpy.URDF.load(
     sys.argv[1],
     build_collision_scene_graph=True,
     load_meshes=True,
     load_collision_meshes=True,
-    filename_handler=lambda name: name.removeprefix("file://").replace("%20", " "),
+    filename_handler=file_of,
 )
 if not robot.validate():
     sys.exit(str(robot.errors))
