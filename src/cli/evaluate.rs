@@ -51,7 +51,7 @@ pub fn run(arguments: &EvaluateArguments) -> anyhow::Result<()> {
         Pipeline::evaluate(config.pipeline_settings(None), object, horizon_s).with_context(|| model_name.clone())?;
     let mut ingest = Ingest::new(&config.input);
     let progress = Progress::of_bytes(bag.summary().bytes);
-    let mut push = |pipeline: &mut Pipeline, input: Input| check(&pipeline.push(input), &model_name);
+    let push = |pipeline: &mut Pipeline, input: Input| check(&pipeline.push(input), &model_name);
     while let Some(message) = bag.next() {
         for input in ingest.push(&message.topic.name, &message.topic.type_name, message.bytes()) {
             push(&mut pipeline, input)?;
