@@ -120,8 +120,10 @@ pub struct Pipeline {
     current: BTreeMap<Label, Pose>,
     recent: Vec<BTreeMap<Label, Pose>>,
     moving: bool,
-    /// Where the parts were when each window closed that was handed out and is not adopted yet.
-    handed_out: VecDeque<BTreeMap<Label, Pose>>,
+    /// Where the parts were when each window closed that was handed out and is not adopted yet, with
+    /// the window's number.
+    handed_out: VecDeque<(u64, BTreeMap<Label, Pose>)>,
+    closed_windows: u64,
     forecaster: Option<Forecaster>,
     /// The latest stamp of a frame.
     newest: Option<Stamp>,
@@ -159,7 +161,13 @@ impl Pipeline {
             begin_s: 0.0,
             newcomers: None,
             handed_out: VecDeque::new(),
+            closed_windows: 0,
         }
+    }
+
+    /// Time zero: the earliest stamp of a cloud, a pose or a wrench; `None` before the first cloud.
+    pub fn zero(&self) -> Option<Stamp> {
+        self.zero
     }
 
     /// The stamp that outputs count their times from, and what the learner's clock says then \[s\]; `None`
@@ -295,18 +303,24 @@ impl Pipeline {
             return None;
         }
         if self.settings.live {
-            self.handed_out.push_back(self.current.clone());
-            return Some(Output::WindowClosed(Box::new(ClosedWindow::new(job, Arc::clone(learner)))));
+            self.closed_windows += 1;
+            self.handed_out.push_back((self.closed_windows, self.current.clone()));
+            let window = ClosedWindow::new(self.closed_windows, job, Arc::clone(learner));
+            return Some(Output::WindowClosed(Box::new(window)));
         }
         Arc::make_mut(learner).learn(&job);
         self.current.extend(learner.displacements.iter().map(|(l, d)| (*l, *d)));
         Some(Output::Learned { span_s: job.span_s() })
     }
 
-    /// Takes over what a worker learned from the oldest window handed out. Parts go on from where
-    /// learning has them at the window's close, as far as they were seen to go since.
+    /// Takes over what a worker learned from a window handed out; older ones are not waited for any
+    /// more. Parts go on from where learning has them at the window's close, as far as they were seen
+    /// to go since.
     pub fn adopt(&mut self, learned: &Learned) -> Output {
-        let at_close = self.handed_out.pop_front().unwrap_or_default();
+        let mut at_close = BTreeMap::new();
+        while let Some((_, poses)) = self.handed_out.pop_front_if(|(number, _)| *number <= learned.sequence) {
+            at_close = poses;
+        }
         for (label, learned_pose) in &learned.learner.displacements {
             let since = match (at_close.get(label), self.current.get(label)) {
                 (Some(before), Some(now)) if before != now => *now * before.inverse(),

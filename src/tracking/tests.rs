@@ -3,9 +3,9 @@
 
 use std::sync::Arc;
 
-use nalgebra::{DMatrix, Vector3};
+use nalgebra::{DMatrix, DVector, Vector3};
 
-use super::{Filter, TrackedMechanism};
+use super::{ActiveNumber, Filter, TrackedMechanism, TreeFamily};
 use crate::math::Pose;
 use crate::mechanism::{
     Body, JointParameters, JointType, State, Tree, WrenchPoint, WrenchSample, WrenchTrack, rollout,
@@ -17,8 +17,6 @@ const CONTACT: Vector3<f64> = Vector3::new(0.5, 0.0, 0.2);
 
 /// A drawer along x of 3 kg.
 pub(super) fn drawer(damping: f64) -> TrackedMechanism {
-    let parameters = JointParameters::new(damping, 3.0);
-    let body = Body { parameters, ..Body::prismatic(None, &Vector3::x(), 3.0) };
     let axis = Axis { direction: Vector3::x(), point: Vector3::zeros() };
     let joint = KinematicJoint {
         parent: None,
@@ -29,10 +27,21 @@ pub(super) fn drawer(damping: f64) -> TrackedMechanism {
         radius: 0.2,
         suggested: None,
     };
+    // Its numbers are ln damping and ln friction.
+    let trees = TreeFamily::new(|numbers| {
+        let parameters = JointParameters::new(numbers[0].exp(), numbers[1].exp());
+        let body = Body { parameters, ..Body::prismatic(None, &Vector3::x(), 3.0) };
+        Tree::new(vec![body], Vector3::new(0.0, 0.0, -9.81)).ok()
+    });
+    let numbers = DVector::from_vec(vec![damping.ln(), 3f64.ln()]);
     TrackedMechanism {
         joints: vec![joint],
-        tree: Tree::new(vec![body], Vector3::new(0.0, 0.0, -9.81)).unwrap(),
-        varied: vec![Vec::new()],
+        tree: trees.tree(&numbers).unwrap(),
+        trees,
+        numbers,
+        active: (0..2).map(|place| ActiveNumber { joint: 0, place }).collect(),
+        covariance: DMatrix::identity(2, 2) * 0.05 * 0.05,
+        explored: vec![[0.0, 1.0]],
         axis_roots: vec![DMatrix::zeros(2, 2)],
         centers: vec![Vector3::zeros()],
         tool_offset: Vector3::new(0.002, -0.001, 0.0),
