@@ -149,7 +149,12 @@ fn a_bag_played_live_gives_what_its_replay_gives() {
     assert_eq!(seen["late"]["description"], true);
     let planned = &seen["planned"];
     for plan in ["pull", "push"] {
-        assert_eq!((&planned[plan]["success"][0], &planned[plan]["label"]), (&json!(true), &planned["part"]), "{}", note());
+        assert_eq!(
+            (&planned[plan]["success"][0], &planned[plan]["label"]),
+            (&json!(true), &planned["part"]),
+            "{}",
+            note()
+        );
         assert_eq!(planned[plan]["labels"], seen["predicted"]["labels"], "{}", note());
         assert!(planned[plan]["variance"].as_f64().unwrap() > 0.0, "{}", note());
     }

@@ -70,6 +70,8 @@ pub struct Chart<'a> {
     pub times_s: (f64, f64),
     /// Zero is always in it.
     pub from_zero: bool,
+    /// What is higher is drawn at this height.
+    pub highest: Option<f64>,
 }
 
 impl Chart<'_> {
@@ -81,6 +83,7 @@ impl Chart<'_> {
         if !(low.is_finite() && high.is_finite()) || self.times_s.1 <= self.times_s.0 {
             return None;
         }
+        high = high.min(self.highest.unwrap_or(f64::INFINITY));
         if self.from_zero {
             (low, high) = (low.min(0.0), high.max(0.0));
         }
@@ -118,6 +121,7 @@ impl Chart<'_> {
             .label_style(label(13))
             .axis_desc_style(label(14))
             .x_labels(12)
+            .x_label_formatter(&|t| format!("{t:.0}"))
             .y_labels(6)
             .x_desc("time [s]")
             .y_desc(&self.value)
@@ -125,7 +129,8 @@ impl Chart<'_> {
         for line in &self.lines {
             for piece in &line.pieces {
                 let thin = piece.len().div_ceil(MOST_POINTS).max(1);
-                let points = piece.iter().step_by(thin).copied();
+                let top = self.highest.unwrap_or(f64::INFINITY);
+                let points = piece.iter().step_by(thin).map(|(t, v)| (*t, v.min(top)));
                 let ink = line.ink.marker();
                 if line.dots {
                     chart.draw_series(points.map(|at| Circle::new(at, 2, ink.filled())))?;
@@ -162,7 +167,7 @@ mod tests {
             lines: vec![line],
             spans: vec![(3.0, 9.0)],
             times_s: (0.0, 49.0),
-            from_zero: false,
+            ..Chart::default()
         };
         let svg = chart.svg().unwrap();
         for part in ["class=\"chart\"", "var(--first)", "var(--held)", "var(--text)", "position [m]"] {

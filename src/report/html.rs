@@ -29,8 +29,7 @@ pub struct Evidence<'a> {
 pub fn page(run: &Run<'_>, evidence: &Evidence<'_>) -> String {
     let posterior = &run.document.posterior;
     let found = Found::new(posterior);
-    let moved: Vec<Label> =
-        Gatherer::joints_of(posterior, &found).iter().map(|joint| joint.edge.child).collect();
+    let moved: Vec<Label> = Gatherer::joints_of(posterior, &found).iter().map(|joint| joint.edge.child).collect();
     html! {
         (DOCTYPE)
         html lang="en" {
@@ -86,7 +85,8 @@ pub fn page(run: &Run<'_>, evidence: &Evidence<'_>) -> String {
                             }
                             (legend(&[("first", "0.5 s ahead"), ("third", "0.1 s ahead"), ("faint", "spread as stated, 0.5 s")]))
                             @for label in moved {
-                                (error_charts(label, &evidence.gatherer.errors(label, posterior), run.stream_s))
+                                @let errors = evidence.gatherer.errors(label, posterior);
+                                (error_charts(label, &errors, run.stream_s, known_since(label, posterior, evidence.zero.1)))
                             }
                         }
                     }
@@ -169,7 +169,7 @@ fn joint_charts(edge: &EdgePosterior, name: &str, series: &JointSeries, stream_s
         ],
         spans: series.held.clone(),
         times_s,
-        from_zero: false,
+        ..Chart::default()
     };
     let forces = Chart {
         value: format!("applied [{force}]"),
@@ -177,6 +177,7 @@ fn joint_charts(edge: &EdgePosterior, name: &str, series: &JointSeries, stream_s
         spans: series.held.clone(),
         times_s,
         from_zero: true,
+        ..Chart::default()
     };
     html! {
         h3 { "Part " (edge.child) ", " (name) " on " (edge.parent) }
@@ -184,7 +185,13 @@ fn joint_charts(edge: &EdgePosterior, name: &str, series: &JointSeries, stream_s
     }
 }
 
-fn error_charts(label: Label, errors: &[ErrorSeries], stream_s: f64) -> Markup {
+/// The close of the first window in which a part was held \[s\].
+fn known_since(label: Label, posterior: &ObjectPosterior, begin_s: f64) -> f64 {
+    let first = posterior.windows.iter().find(|window| window.labels.contains(&label));
+    first.map_or(0.0, |window| window.t1_s - begin_s)
+}
+
+fn error_charts(label: Label, errors: &[ErrorSeries], stream_s: f64, known_s: f64) -> Markup {
     let at = |horizon_s: f64| errors.iter().find(|series| (series.horizon_s - horizon_s).abs() < 1e-6);
     let mut lines = Vec::new();
     if let Some(middle) = at(0.5) {
@@ -194,14 +201,23 @@ fn error_charts(label: Label, errors: &[ErrorSeries], stream_s: f64) -> Markup {
     if let Some(near) = at(0.1) {
         lines.push(Line { pieces: vec![&near.errors], ink: Ink::Third, dots: false });
     }
-    let chart = Chart { value: "error [m]".into(), lines, spans: Vec::new(), times_s: (0.0, stream_s), from_zero: true };
+    // Before a part's first window nothing is known of its joint: those errors are off the scale.
+    let largest = at(0.5).map_or(0.0, |series| series.since(known_s).fold(0.0, f64::max));
+    let chart = Chart {
+        value: "error [mm]".into(),
+        lines,
+        times_s: (0.0, stream_s),
+        from_zero: true,
+        highest: Some((1.5 * largest).max(10.0)),
+        ..Chart::default()
+    };
     let summary: Vec<String> = errors
         .iter()
-        .filter(|series| !series.errors.is_empty())
-        .map(|series| format!("{:.1} mm at {} s", 1e3 * series.rms(), series.horizon_s))
+        .filter(|series| series.since(known_s).next().is_some())
+        .map(|series| format!("{:.1} mm at {} s", series.rms(known_s), series.horizon_s))
         .collect();
     html! {
-        h3 { "Part " (label) span class="quiet" { " root mean square over all frames: " (summary.join(", ")) } }
+        h3 { "Part " (label) span class="quiet" { " root mean square once its joint was known: " (summary.join(", ")) } }
         @if let Some(chart) = chart.svg() { (PreEscaped(chart)) }
     }
 }
@@ -212,7 +228,7 @@ fn dynamics(posterior: &ObjectPosterior, found: &Found<'_>) -> Markup {
         return html! { p class="note" { "No joint was moved: nothing is known of its dynamics." } };
     }
     html! {
-        p class="note" { "Median and 90 % interval; the bar shows them from a hundredth to a hundred times the median." }
+        p class="note" { "Median and 90 % interval; the bar goes from half the median to twice." }
         div class="wide" { table {
             thead { tr { th { "part" } th { "quantity" } th { "median" } th { "90 % interval" } th {} th {} th { "from" } } }
             tbody { @for joint in &joints {
@@ -238,9 +254,9 @@ fn dynamics(posterior: &ObjectPosterior, found: &Found<'_>) -> Markup {
     }
 }
 
-/// The interval about the median, on a logarithmic scale of four decades.
+/// The interval about the median, on a logarithmic scale from half of it to twice.
 fn bar(q: &Quantity) -> Markup {
-    let place = |x: f64| if x > 0.0 { (50.0 + 25.0 * (x / q.median).log10()).clamp(1.0, 99.0) } else { 1.0 };
+    let place = |x: f64| if x > 0.0 { (50.0 + 50.0 * (x / q.median).log2()).clamp(0.0, 100.0) } else { 1.0 };
     if q.median <= 0.0 || q.q05 <= 0.0 {
         return html! {};
     }

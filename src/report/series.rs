@@ -40,16 +40,22 @@ pub struct JointSeries {
 pub struct ErrorSeries {
     /// Horizon \[s\].
     pub horizon_s: f64,
-    /// Of its centre, by the time meant \[m\].
+    /// Of its centre, by the time meant \[mm\].
     pub errors: Series,
-    /// The spread that was stated, root of the summed variances \[m\].
+    /// The spread that was stated, root of the summed variances \[mm\].
     pub stated: Series,
 }
 
 impl ErrorSeries {
-    /// Root mean square \[m\].
-    pub fn rms(&self) -> f64 {
-        (self.errors.iter().map(|(_, e)| e * e).sum::<f64>() / self.errors.len().max(1) as f64).sqrt()
+    /// The errors from a time on \[mm\], of what was predicted from then on.
+    pub fn since(&self, from_s: f64) -> impl Iterator<Item = f64> {
+        self.errors.iter().filter(move |(t, _)| *t >= from_s + self.horizon_s).map(|(_, error)| *error)
+    }
+
+    /// Root mean square from a time on \[mm\].
+    pub fn rms(&self, from_s: f64) -> f64 {
+        let (sum, count) = self.since(from_s).fold((0.0, 0.0), |(sum, count), e| (sum + e * e, count + 1.0));
+        (sum / f64::max(count, 1.0)).sqrt()
     }
 }
 
@@ -95,10 +101,9 @@ impl Gatherer {
         let parents = self.observed.get(&joint.edge.parent).map_or(&[][..], Vec::as_slice);
         let mut last = 0.0;
         for (time_s, displacement) in self.observed.get(&child).into_iter().flatten() {
-            let parent = parents.binary_search_by(|(t, _)| t.total_cmp(time_s)).map_or_else(
-                |_| Pose::identity(),
-                |index| parents[index].1,
-            );
+            let parent = parents
+                .binary_search_by(|(t, _)| t.total_cmp(time_s))
+                .map_or_else(|_| Pose::identity(), |index| parents[index].1);
             last = axis.position(&(parent.inverse() * *displacement), &center, last);
             series.observed.push((*time_s, last));
         }
@@ -129,8 +134,8 @@ impl Gatherer {
                 let at = observed.partition_point(|(t, _)| *t < time_s - 0.02);
                 let Some((t, seen)) = observed.get(at).filter(|(t, _)| (t - time_s).abs() <= 0.02) else { continue };
                 let miss = expected.transform_point(&center) - seen.transform_point(&center);
-                series.errors.push((*t, miss.norm()));
-                series.stated.push((*t, *spread));
+                series.errors.push((*t, 1e3 * miss.norm()));
+                series.stated.push((*t, 1e3 * spread));
             }
             series
         };

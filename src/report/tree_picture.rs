@@ -9,7 +9,7 @@ use crate::types::Label;
 use crate::types::posterior::ObjectPosterior;
 
 /// Distance between neighbours and between generations, and a part's half size \[px\].
-const STEP: (f64, f64) = (150.0, 96.0);
+const STEP: (f64, f64) = (150.0, 100.0);
 const HALF: (f64, f64) = (34.0, 17.0);
 /// Edges less likely than this are not shown.
 const SHOWN: f64 = 0.02;
@@ -27,7 +27,7 @@ pub fn tree_picture(posterior: &ObjectPosterior, found: &Found<'_>) -> Markup {
     place(posterior.root_label, 0, &children, &mut next, &mut places);
     let deepest = places.values().map(|(_, y)| *y).fold(0.0, f64::max);
     let width = STEP.0 * f64::max(next, 1.0);
-    let view = format!("0 0 {width} {}", deepest + 2.0 * HALF.1 + 16.0);
+    let view = format!("0 0 {width} {}", deepest + HALF.1 + 28.0);
     html! {
         svg class="tree" viewBox=(view) role="img" style=(format!("max-width: {width}px")) {
             @for edge in &posterior.edges {
@@ -43,7 +43,7 @@ pub fn tree_picture(posterior: &ObjectPosterior, found: &Found<'_>) -> Markup {
                     @if let Some((px, py)) = places.get(&joint.edge.parent) {
                         @let name = joint.settled().unwrap_or("open");
                         line class=(format!("joint {name}")) x1=(px) y1=(py) x2=(x) y2=(y) {}
-                        text class="type" x=(0.5 * (px + x) + 8.0) y=(0.5 * (py + y) + 4.0) {
+                        text class="type" x=(x) y=(y + HALF.1 + 16.0) {
                             (name) " " (format!("{:.2}", joint.probability))
                         }
                     }
