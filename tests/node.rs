@@ -149,7 +149,12 @@ fn a_bag_played_live_gives_what_its_replay_gives() {
     assert_eq!(seen["late"]["description"], true);
     let planned = &seen["planned"];
     for plan in ["pull", "push"] {
-        assert_eq!((&planned[plan]["success"][0], &planned[plan]["label"]), (&json!(true), &planned["part"]), "{}", note());
+        assert_eq!(
+            (&planned[plan]["success"][0], &planned[plan]["label"]),
+            (&json!(true), &planned["part"]),
+            "{}",
+            note()
+        );
         assert_eq!(planned[plan]["labels"], seen["predicted"]["labels"], "{}", note());
         assert!(planned[plan]["variance"].as_f64().unwrap() > 0.0, "{}", note());
     }
@@ -182,7 +187,8 @@ fn parameters_lifecycle_and_services_answer_rclpy() {
     assert_eq!(seen["state"], "active", "{}", note());
     assert!(seen["names"].as_array().unwrap().len() > 35, "{}", note());
     assert!(seen["below"].as_array().unwrap().contains(&json!("windows.quiet_s")), "{}", note());
-    assert_eq!(seen["below"].as_array().unwrap().len(), 5, "{}", note());
+    let below = seen["below"].as_array().unwrap();
+    assert!(below.iter().all(|name| name.as_str().unwrap().starts_with("windows.")), "{}", note());
     assert_eq!(
         seen["quiet"],
         json!([3, "It closes after this long without contact and motion [s].", false, [1e6]]),

@@ -36,8 +36,8 @@ use tokio::sync::Notify;
 use tracing::{info, warn};
 
 use arguments::RosArguments;
-use health::SharedHealth;
 use drawing::Drawing;
+use health::SharedHealth;
 use inbox::Inbox;
 use learning::Learning;
 use names::Names;
@@ -63,7 +63,9 @@ pub fn run(arguments: &RosArguments) -> anyhow::Result<()> {
     let names = Names::new(NAME, arguments)?;
     let mut parameters = Parameters::declared();
     let unusable = parameters.start_with(&arguments.overrides, &names);
-    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().context("tokio")?;
+    learning::go_first();
+    let runtime =
+        tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().context("tokio")?;
     runtime.block_on(live(&names, parameters, unusable, !arguments.rosout_disabled))
 }
 
@@ -96,9 +98,9 @@ async fn live(names: &Names, parameters: Parameters, unusable: Vec<String>, roso
         Learning::start(threads, health.clone(), move |life, learned| adopt.tell(Command::Adopt(life, learned)))?;
     let meshes = parameters.get("mesh_folder").and_then(value::Value::as_text).filter(|folder| !folder.is_empty());
     let drawing = Drawing::start(outputs.clone(), meshes.map(PathBuf::from))?;
-    let stream =
-        Stream::new(Arc::clone(&inbox), learning, (outputs.clone(), drawing), health.clone(), input.clone());
-    let thread = std::thread::Builder::new().name("stream".into()).spawn(|| stream.run()).context("the stream's thread")?;
+    let stream = Stream::new(Arc::clone(&inbox), learning, (outputs.clone(), drawing), health.clone(), input.clone());
+    let thread =
+        std::thread::Builder::new().name("stream".into()).spawn(|| stream.run()).context("the stream's thread")?;
     let mut subscriptions =
         Subscriptions::new(&mut participant, &parameters, &input, Arc::clone(&inbox), health.clone())?;
     endpoints.extend(subscriptions.names.clone());
@@ -158,7 +160,10 @@ async fn watch_network(
                 endpoints.extend(subscriptions.names.clone());
             }
             DomainParticipantStatusEvent::RemoteWriterQosIncompatible {
-                local_reader, requested_qos, offered_qos, ..
+                local_reader,
+                requested_qos,
+                offered_qos,
+                ..
             } => {
                 if let Some(topic) = endpoints.get(&local_reader) {
                     let line = mismatch("a publisher's QoS does not fit", &requested_qos, &offered_qos);
@@ -166,7 +171,10 @@ async fn watch_network(
                 }
             }
             DomainParticipantStatusEvent::RemoteReaderQosIncompatible {
-                local_writer, requested_qos, offered_qos, ..
+                local_writer,
+                requested_qos,
+                offered_qos,
+                ..
             } => {
                 if let Some(topic) = endpoints.get(&local_writer) {
                     let line = mismatch("a subscriber's QoS does not fit", &requested_qos, &offered_qos);

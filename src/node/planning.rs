@@ -65,7 +65,10 @@ fn plan(ground: &Ground, request: &PredictRequest) -> anyhow::Result<Plan> {
         let (force, torque) = (direction(&segment.wrench.force), direction(&segment.wrench.torque));
         let finite = force.iter().chain(&torque).all(|x| x.is_finite());
         if !(segment.duration > 0.0 && segment.duration <= LONGEST_S && finite) {
-            bail!("a segment of {} s: expected above 0 and at most {LONGEST_S} s, and a finite wrench", segment.duration);
+            bail!(
+                "a segment of {} s: expected above 0 and at most {LONGEST_S} s, and a finite wrench",
+                segment.duration
+            );
         }
         profile.push((time_s, force, torque));
         time_s += segment.duration;

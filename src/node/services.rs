@@ -30,9 +30,9 @@ use tracing::{info, warn};
 use super::health::SharedHealth;
 use super::inbox::Inbox;
 use super::lifecycle::{State, Transition};
-use super::planning;
 use super::parameters::Parameters;
 use super::participant::{Participant, Wire};
+use super::planning;
 use super::publications::{Outputs, Publication};
 use super::stream::Command;
 use super::value::Value;
@@ -320,7 +320,9 @@ fn serve_parameters(participant: &mut Participant, managed: &Managed) -> anyhow:
     let service = ("~/describe_parameters", "rcl_interfaces/srv/DescribeParameters");
     at_once(participant, managed, service, |managed, request: DescribeParametersRequest| {
         let parameters = managed.parameters();
-        DescribeParametersResponse { descriptors: request.names.iter().map(|name| parameters.descriptor(name)).collect() }
+        DescribeParametersResponse {
+            descriptors: request.names.iter().map(|name| parameters.descriptor(name)).collect(),
+        }
     })
 }
 
