@@ -80,6 +80,10 @@ impl<D: LogDensity> LogDensity for Whitened<'_, D> {
         let (value, slope) = self.density.evaluate(&self.restore(z))?;
         let slope = self.root.transpose() * slope;
         // A sampler must never see a number that is none.
-        if value.is_finite() && slope.iter().all(|s| s.is_finite()) { Ok((value, slope)) } else { Err(Failure::Diverged) }
+        if value.is_finite() && slope.iter().all(|s| s.is_finite()) {
+            Ok((value, slope))
+        } else {
+            Err(Failure::Diverged)
+        }
     }
 }

@@ -45,9 +45,9 @@ pub(super) fn hmc_chain(
         let energy = 0.5 * momentum.norm_squared() - here.value;
         let (end, spent) = leapfrog(density, &here, momentum, step, steps);
         chain.evaluations += spent;
-        let gained = end.as_ref().map_or(f64::NEG_INFINITY, |(place, momentum)| {
-            energy - (0.5 * momentum.norm_squared() - place.value)
-        });
+        let gained = end
+            .as_ref()
+            .map_or(f64::NEG_INFINITY, |(place, momentum)| energy - (0.5 * momentum.norm_squared() - place.value));
         chain.divergences += usize::from(!warming && gained < -DIVERGED);
         if let Some((place, _)) = end
             && rng.random::<f64>().ln() < gained

@@ -45,8 +45,7 @@ fn laplace(model: Model, prior: &Gaussian) -> (Gaussian, Moments) {
 }
 
 fn sampled(density: &impl LogDensity, approximation: &Gaussian, sampler: Sampler) -> (Moments, Samples) {
-    let settings =
-        SamplingSettings { sampler, chains: 4, warmup: 500, draws: 2500, seed: 7, leapfrog_steps: 63 };
+    let settings = SamplingSettings { sampler, chains: 4, warmup: 500, draws: 2500, seed: 7, leapfrog_steps: 63 };
     let samples = sample(density, approximation, &settings).unwrap();
     let moments = (0..density.dimension())
         .map(|i| {
@@ -124,7 +123,8 @@ fn a_conjugate_regression() {
     };
     let prior = standard_prior(2, 1.0);
     // Λ = Σ (1, t)ᵀ(1, t)/σ² + 1 and h = Σ (1, t)ᵀ y/σ², σ = .5.
-    let (s1, st, stt) = POINTS.iter().fold((0.0, 0.0, 0.0), |(a, b, c), (t, _)| (a + 4.0, b + 4.0 * t, c + 4.0 * t * t));
+    let (s1, st, stt) =
+        POINTS.iter().fold((0.0, 0.0, 0.0), |(a, b, c), (t, _)| (a + 4.0, b + 4.0 * t, c + 4.0 * t * t));
     let (hy, hty) = POINTS.iter().fold((0.0, 0.0), |(a, b), (t, y)| (a + 4.0 * y, b + 4.0 * t * y));
     let (a, b, c) = (s1 + 1.0, st, stt + 1.0);
     let determinant = a * c - b * b;

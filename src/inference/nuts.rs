@@ -61,8 +61,7 @@ pub(super) fn nuts_chain(
         maxdepth: u64::from((settings.leapfrog_steps + 1).ilog2().max(1)),
         ..DiagNutsSettings::default()
     };
-    let mut sampler =
-        options.new_chain(index, CpuMath::new(Target(density)), rng).map_err(|_| Failure::Diverged)?;
+    let mut sampler = options.new_chain(index, CpuMath::new(Target(density)), rng).map_err(|_| Failure::Diverged)?;
     sampler.set_position(start.as_slice()).map_err(|_| Failure::Diverged)?;
     let mut chain = Chain { draws: Vec::with_capacity(settings.draws), divergences: 0, evaluations: 1 };
     for draw in 0..settings.warmup + settings.draws {

@@ -114,7 +114,8 @@ impl Samples {
 /// Split R̂: the potential scale reduction over half chains (Gelman et al., "Bayesian Data Analysis",
 /// 2013, section 11.4); near one if the chains agree.
 pub fn split_r_hat(chains: &[Vec<f64>]) -> f64 {
-    let halves: Vec<&[f64]> = chains.iter().flat_map(|c| [&c[..c.len() / 2], &c[c.len() / 2..2 * (c.len() / 2)]]).collect();
+    let halves: Vec<&[f64]> =
+        chains.iter().flat_map(|c| [&c[..c.len() / 2], &c[c.len() / 2..2 * (c.len() / 2)]]).collect();
     let (m, n) = (halves.len() as f64, halves.first().map_or(0, |h| h.len()) as f64);
     if m < 2.0 || n < 2.0 {
         return f64::INFINITY;

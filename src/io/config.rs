@@ -7,10 +7,12 @@ use std::{
     path::{Path, PathBuf},
 };
 
+use clap::ValueEnum;
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 use thiserror::Error;
 
 use crate::{
+    inference::{Sampler, SamplingSettings},
     model::KinematicSettings,
     pipeline::{PipelineSettings, WindowSettings},
     types::Label,
@@ -45,12 +47,18 @@ pub enum ConfigError {
 pub struct Config {
     /// Seed of all random numbers.
     pub seed: u64,
+    /// What the published dynamics come from.
+    pub engine: Engine,
+    /// How long HMC and NUTS sample.
+    pub sampling: SamplingConfig,
     /// Gravity in world \[m/s²\].
     pub gravity_m_s2: [f64; 3],
     /// Topics, frames and what to make of them.
     pub input: InputConfig,
     /// A posterior counts from its window's close plus this, in stamp time \[s\].
     pub posterior_latency_s: f64,
+    /// `bom evaluate` simulates this far from what was seen \[s\].
+    pub evaluation_horizon_s: f64,
     /// When interaction windows open and close.
     pub windows: WindowSettings,
     /// What counts as an observation.
@@ -63,9 +71,12 @@ impl Default for Config {
     fn default() -> Self {
         Self {
             seed: 0,
+            engine: Engine::Svi,
+            sampling: SamplingConfig::default(),
             gravity_m_s2: [0.0, 0.0, -9.81],
             input: InputConfig::default(),
             posterior_latency_s: 0.0,
+            evaluation_horizon_s: 1.0,
             windows: WindowSettings::default(),
             observations: ObservationConfig::default(),
             kinematics: KinematicSettings::default(),
@@ -82,9 +93,21 @@ impl Config {
             windows: self.windows,
             kinematics: self.kinematics,
             gravity_in_world: self.gravity_m_s2.into(),
+            sampling: self.sampling(),
             predict: false,
             posterior_latency_s: self.posterior_latency_s,
+            live: false,
         }
+    }
+
+    fn sampling(&self) -> Option<SamplingSettings> {
+        let sampler = match self.engine {
+            Engine::Svi => return None,
+            Engine::Hmc => Sampler::Hmc,
+            Engine::Nuts => Sampler::Nuts,
+        };
+        let SamplingConfig { chains, warmup, draws, leapfrog_steps } = self.sampling;
+        Some(SamplingSettings { sampler, chains, warmup, draws, seed: self.seed, leapfrog_steps })
     }
 
     /// Reads a file.
@@ -126,6 +149,7 @@ impl Config {
         let positive = [
             ("windows.force_threshold_n", self.windows.force_threshold_n),
             ("windows.smoothing_s", self.windows.smoothing_s),
+            ("evaluation_horizon_s", self.evaluation_horizon_s),
             ("windows.quiet_s", self.windows.quiet_s),
             ("windows.longest_s", self.windows.longest_s),
             ("kinematics.tool_offset_sigma", self.kinematics.tool_offset_sigma),
@@ -133,6 +157,7 @@ impl Config {
             ("kinematics.shared_distance", self.kinematics.shared_distance),
             ("kinematics.rest_deviations", self.kinematics.rest_deviations),
             ("kinematics.student_freedom", self.kinematics.student_freedom),
+            ("windows.kept", self.windows.kept as f64),
             ("kinematics.steps", self.kinematics.steps as f64),
         ];
         positive.into_iter().try_for_each(|(key, value)| positive_number(key, value))?;
@@ -142,7 +167,51 @@ impl Config {
                 return Err((key.into(), format!("{value}, expected 0 to 1e6")));
             }
         }
+        let SamplingConfig { chains, warmup, draws, leapfrog_steps } = self.sampling;
+        for (key, value, least) in [
+            ("sampling.chains", chains, 1),
+            ("sampling.warmup", warmup, 1),
+            ("sampling.draws", draws, 10),
+            ("sampling.leapfrog_steps", leapfrog_steps, 1),
+        ] {
+            if !(least..=1_000_000).contains(&value) {
+                return Err((key.into(), format!("{value}, expected {least} to 1000000")));
+            }
+        }
         self.input.check()
+    }
+}
+
+/// What the published dynamics come from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Engine {
+    /// Gaussian factors by natural gradients
+    #[default]
+    Svi,
+    /// Hamiltonian Monte Carlo
+    Hmc,
+    /// The no-U-turn sampler
+    Nuts,
+}
+
+/// How long HMC and NUTS sample.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SamplingConfig {
+    /// Chains, side by side.
+    pub chains: usize,
+    /// Draws per chain that tune the step and are thrown away.
+    pub warmup: usize,
+    /// Draws per chain that are kept.
+    pub draws: usize,
+    /// Evaluations of the density per draw at most.
+    pub leapfrog_steps: usize,
+}
+
+impl Default for SamplingConfig {
+    fn default() -> Self {
+        Self { chains: 2, warmup: 60, draws: 200, leapfrog_steps: 15 }
     }
 }
 
