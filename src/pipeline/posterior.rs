@@ -63,7 +63,7 @@ fn posterior(
 ) -> ObjectPosterior {
     let labels: Vec<Label> = points.keys().copied().collect();
     let mut parts: Vec<PartPosterior> = points.iter().filter_map(|(label, points)| part(*label, points)).collect();
-    let dynamics = learner.and_then(|learner| learner.dynamics.posterior().ok());
+    let dynamics = learner.and_then(Learner::published_dynamics);
     for learned in dynamics.iter().flat_map(|dynamics| &dynamics.parts) {
         if let Some(part) = parts.iter_mut().find(|part| part.label == learned.label) {
             part.com_in_world_m = learned.com_in_world.into();
