@@ -4,6 +4,8 @@ mod explain;
 mod forecast;
 mod learner;
 mod posterior;
+mod touch;
+mod whereabouts;
 mod windows;
 mod working_frame;
 
@@ -102,7 +104,7 @@ impl Pipeline {
     /// A pipeline that has seen nothing.
     pub fn new(settings: PipelineSettings) -> Self {
         let forecaster =
-            settings.predict.then(|| Forecaster::new(settings.root, settings.use_tool, settings.posterior_latency_s));
+            settings.predict.then(|| Forecaster::new(settings.root, settings.posterior_latency_s));
         Self {
             forecaster,
             settings,

@@ -10,6 +10,7 @@
 //! wrench sensor's noise makes, times κ for what the model misses.
 //! Corrections: x − o = D(q) p by the tool, log(T(−c) D_obs⁻¹ D(q) T(c)) = 0 by every cloud.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, SMatrix, SVector, Vector3, Vector6};
@@ -38,6 +39,11 @@ const NUMBER_DEVIATION: (f64, f64) = (0.03, 0.7);
 const STUCK_MEMORY: f64 = 0.03;
 /// Registration error that the frames share \[m\].
 const SHARED_ERROR: f64 = 0.004;
+/// A lost part is looked for along its joint in steps of this \[m\], this far beyond where it was seen
+/// \[m\], at no more places than so many.
+const SEARCH_STEP: f64 = 0.01;
+const SEARCH_BEYOND: f64 = 0.1;
+const MOST_PLACES: usize = 120;
 /// χ² of three or six numbers that no filter in order sees.
 const GATE: f64 = 30.0;
 /// Innovations this much larger than expected, on the mean of the last so many, raise the process noise.
@@ -93,8 +99,6 @@ pub struct Filter {
     surprise: f64,
     /// Joints that what is held does not follow.
     pub(super) distrusted: Vec<bool>,
-    /// Positions at the start.
-    started_at: Vec<f64>,
     /// Least and greatest position of each joint so far.
     pub(super) explored: Vec<[f64; 2]>,
     cursor: usize,
@@ -128,10 +132,8 @@ impl Filter {
             covariance[(i, i)] += NUMBER_DEVIATION.0.powi(2);
         }
         let workspace = Workspace::new(&mechanism.tree);
-        let start = positions.clone();
         let state = State::new(positions, rates);
         Self {
-            started_at: start,
             explored: mechanism.explored.clone(),
             distrusted: vec![false; n],
             disturbance: vec![0.0; n],
@@ -189,14 +191,46 @@ impl Filter {
         (0..self.mechanism.joints.len()).filter(rests).map(|joint| (joint, self.state.positions[joint])).collect()
     }
 
-    /// A part that is not where it should be, with all that carries it, is where the filter started, at rest.
-    pub fn lose(&mut self, label: Label) {
-        let Some(body) = self.mechanism.body(label) else { return };
-        for joint in self.mechanism.chain(body) {
-            self.state.positions[joint] = self.started_at[joint];
-            self.state.rates[joint] = 0.0;
+    /// Displacements of the parts whose joints are trusted.
+    pub fn trusted_parts(&self) -> BTreeMap<Label, Pose> {
+        let displacements = self.mechanism.tree.displacements(&self.state.positions);
+        let joints = self.mechanism.joints.iter().zip(displacements).enumerate();
+        joints
+            .filter(|(body, _)| !self.mechanism.chain(*body).iter().any(|joint| self.distrusted[*joint]))
+            .map(|(_, (joint, displacement))| (joint.child, displacement))
+            .collect()
+    }
+
+    /// Positions of a body's joint all through where it was seen and somewhat beyond, with the body's
+    /// displacement there.
+    pub fn places_along(&self, body: usize) -> Vec<(f64, Pose)> {
+        let [low, high] = self.explored[body];
+        let step = SEARCH_STEP / self.mechanism.reach(body);
+        let beyond = SEARCH_BEYOND / self.mechanism.reach(body);
+        let count = (((high - low + 2.0 * beyond) / step).ceil().max(1.0) as usize).min(MOST_PLACES);
+        let joint = &self.mechanism.joints[body];
+        let displacements = self.mechanism.tree.displacements(&self.state.positions);
+        let above = joint.parent.map_or_else(Pose::identity, |parent| displacements[parent]);
+        (0..=count)
+            .map(|i| low - beyond + (high - low + 2.0 * beyond) * i as f64 / count as f64)
+            .map(|q| (q, above * joint.screw().displacement(q)))
+            .collect()
+    }
+
+    /// Puts a body's joint at a position where it was found, at rest; what holds it must take hold anew.
+    pub fn place(&mut self, body: usize, position: f64) {
+        let n = self.mechanism.joints.len();
+        if self.held.is_some_and(|held| self.mechanism.chain(held.body).contains(&body)) {
+            self.release();
         }
+        self.state.positions[body] = position;
+        self.state.rates[body] = 0.0;
         self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
+        for at in [body, n + body] {
+            self.covariance.row_mut(at).fill(0.0);
+            self.covariance.column_mut(at).fill(0.0);
+        }
+        self.covariance[(body, body)] = (SEARCH_STEP / self.mechanism.reach(body)).powi(2);
     }
 
     /// What moves a body is not as the mechanism says: it stops, and is not forecast.

@@ -4,15 +4,21 @@
 //! where nothing touches it ([`FreePart`]). A joint: the filter's position and rate, simulated on under
 //! the applied wrench at the carried contact point ([`Filter`], [`Filter::forecast`]).
 
+mod calibration;
 mod filter;
 mod forecast;
 mod free;
 mod mechanism;
+mod presence;
 mod simulation;
+mod skill;
 #[cfg(test)]
 mod tests;
 
+pub use calibration::{Calibration, Kind};
 pub use filter::{Filter, Held};
-pub use forecast::Forecast;
+pub use forecast::{Forecast, mix};
 pub use free::FreePart;
+pub use presence::{Account, Presence};
+pub use skill::Skill;
 pub use mechanism::{ActiveNumber, TrackedMechanism, TreeFamily};
