@@ -107,13 +107,13 @@ pub(super) struct Forecaster {
     last: BTreeMap<Label, Pose>,
     toucher: Toucher,
     whereabouts: Whereabouts,
+    told: BTreeMap<Label, Told>,
     /// Where parts were found, by time.
     found: BTreeMap<Label, Vec<(f64, Pose)>>,
     /// Predictions that are not yet judged.
     issued: VecDeque<Issued>,
     calibration: Calibration<3>,
     skills: BTreeMap<Label, [Skill; JUDGED.len()]>,
-    rest_force: Vector3<f64>,
     waiting: Vec<Waiting>,
     seen: VecDeque<Seen>,
     labels: BTreeSet<Label>,
@@ -135,11 +135,11 @@ impl Forecaster {
             last: BTreeMap::new(),
             toucher: Toucher::default(),
             whereabouts: Whereabouts::default(),
+            told: BTreeMap::new(),
             found: BTreeMap::new(),
             issued: VecDeque::new(),
             calibration: Calibration::default(),
             skills: BTreeMap::new(),
-            rest_force: Vector3::zeros(),
             waiting: Vec::new(),
             seen: VecDeque::new(),
             labels: BTreeSet::new(),
@@ -210,6 +210,11 @@ impl Forecaster {
         self.filter.as_ref()
     }
 
+    /// What was last known of every part.
+    pub fn told(&self) -> &BTreeMap<Label, Told> {
+        &self.told
+    }
+
     /// Takes in a frame as it was measured; `rest_force` is what the sensor reads untouched \[N\].
     pub fn push_frame(
         &mut self,
@@ -242,7 +247,7 @@ impl Forecaster {
                 self.whereabouts.leave(label);
             }
         }
-        self.rest_force = rest_force;
+        self.told.clone_from(&told);
         self.judge(now_s, &told, learner);
         self.forget(now_s);
         self.pending.push_back(Pending {
@@ -282,6 +287,7 @@ impl Forecaster {
             filter.set_adapting(seen.time_s > new.close_s);
             follow(&mut filter, seen, &self.samples, learner, (&mut self.denials, &mut self.last));
         }
+        filter.set_adapting(true);
         self.filter = Some(filter);
         true
     }
@@ -329,7 +335,7 @@ impl Forecaster {
                 let expected = displacement.transform_point(&center);
                 let moves = (expected - told.now.transform_point(&center)).norm() > MOVES;
                 let kind = Kind { by_joint: joint.is_some() && told.by_joint > 0.5, moves };
-                let scale = if root { 1.0 } else { pending.calibration.scale(kind, horizon) };
+                let scale = if root { 1.0 } else { pending.calibration.scale(kind, horizon, &covariance) };
                 if !root {
                     let target_s = pending.time_s + horizon_s;
                     let label = *label;

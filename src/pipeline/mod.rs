@@ -4,6 +4,7 @@ mod explain;
 mod forecast;
 mod learner;
 mod posterior;
+mod profile;
 mod touch;
 mod whereabouts;
 mod windows;
@@ -15,6 +16,7 @@ use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
 pub use explain::Frame;
 pub use learner::{Learner, ParentEvidence, WindowJob};
+pub use profile::{PartForecast, ProfileError, ProfileSample, WrenchProfile};
 pub use windows::{FrameAssembler, WindowCutter, WindowSettings};
 
 use crate::math::Pose;

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use nalgebra::{Matrix6, Vector6};
+use nalgebra::{Matrix6, Vector3, Vector6};
 
 use super::explain::{FEWEST_POINTS, travel};
 use super::touch::Toucher;
@@ -161,7 +161,7 @@ fn register(
     poses: &[(f64, Pose)],
     now_s: f64,
     known: &Pose,
-    tool: &[(f64, nalgebra::Vector3<f64>)],
+    tool: &[(f64, Vector3<f64>)],
 ) -> Pose {
     let points: Vec<ScanPoint> = scan.iter().step_by((scan.len() / SCAN_POINTS).max(1)).copied().collect();
     let r = model.radius;
@@ -188,13 +188,15 @@ fn register(
         return pose;
     }
     let center = Pose::from_translation(model.centroid);
+    let mean = points.iter().map(|p| p.point_in_world).sum::<Vector3<f64>>() / points.len().max(1) as f64;
+    let last = Pose::from_translation(mean - last.transform_point(&model.centroid)) * last;
     let turned: Vec<Pose> = (0..6)
         .map(|i| {
             let mut turn = Vector6::zeros();
             turn[i / 2] = if i % 2 == 0 { TURN } else { -TURN };
             last * center * Pose::exp(&turn) * Pose::from_translation(-model.centroid)
         })
-        .chain([*known])
+        .chain([*known, last])
         .collect();
     let (other, far) = best(&turned);
     if other < least { far } else { pose }

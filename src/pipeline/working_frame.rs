@@ -59,7 +59,7 @@ impl Pipeline {
         self.world_from_work().rotation.transpose() * self.settings.gravity_in_world
     }
 
-    fn world_from_work(&self) -> Pose {
+    pub(super) fn world_from_work(&self) -> Pose {
         match self.working_frame {
             WorkingFrame::Open(_) => Pose::identity(),
             WorkingFrame::Known(pose) => pose,

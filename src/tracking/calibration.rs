@@ -15,7 +15,9 @@ const MOST: f64 = 25.0;
 /// Registration noise of where a part then was \[m\].
 const NOISE: f64 = 0.002;
 /// Least and greatest scale of the variance.
-const BOUNDS: (f64, f64) = (0.5, 25.0);
+const BOUNDS: (f64, f64) = (0.25, 25.0);
+/// Standard deviation down to which a part at rest can show that less would do \[m\].
+const SELF_AGREEMENT: f64 = 0.005;
 
 /// The scales of one object's predictions.
 #[derive(Clone, Copy, Debug)]
@@ -55,12 +57,13 @@ impl<const HORIZONS: usize> Calibration<HORIZONS> {
         *count = FADING * *count + 1.0;
     }
 
-    /// What to scale a covariance by. A part at rest agrees with itself: only its motion can show that
-    /// too much was allowed.
-    pub fn scale(&self, kind: Kind, horizon: usize) -> f64 {
+    /// What to scale a covariance \[m²\] by. A part at rest agrees with itself to a millimetre or two,
+    /// wrong or not: its spread is not lowered below that.
+    pub fn scale(&self, kind: Kind, horizon: usize, covariance: &Matrix3<f64>) -> f64 {
         let (sum, count) = self.sums[kind.index()][horizon];
-        let least = if kind.moves { BOUNDS.0 } else { 1.0 };
-        ((PRIOR + sum) / (PRIOR + count)).clamp(least, BOUNDS.1)
+        let shown = ((PRIOR + sum) / (PRIOR + count)).clamp(BOUNDS.0, BOUNDS.1);
+        let own = covariance.trace() / 3.0;
+        if kind.moves || shown > 1.0 || own <= 0.0 { shown } else { shown.max((SELF_AGREEMENT.powi(2) / own).min(1.0)) }
     }
 }
 
@@ -72,15 +75,15 @@ mod tests {
     fn scales_follow_the_errors() {
         let kind = Kind { by_joint: true, moves: true };
         let mut calibration = Calibration::<2>::default();
-        assert_eq!(calibration.scale(kind, 0), 1.0);
         let covariance = Matrix3::identity() * 1e-4;
+        assert_eq!(calibration.scale(kind, 0, &covariance), 1.0);
         for i in 0..300 {
             let error = Vector3::new(0.02, -0.02, 0.02) * f64::from(i % 2 * 2 - 1);
             calibration.learn(kind, 0, &error, &covariance);
         }
-        let scale = calibration.scale(kind, 0);
+        let scale = calibration.scale(kind, 0, &covariance);
         assert!((2.5..4.5).contains(&scale), "{scale}");
-        assert_eq!(calibration.scale(kind, 1), 1.0);
-        assert_eq!(calibration.scale(Kind { moves: false, ..kind }, 0), 1.0);
+        assert_eq!(calibration.scale(kind, 1, &covariance), 1.0);
+        assert_eq!(calibration.scale(Kind { moves: false, ..kind }, 0, &covariance), 1.0);
     }
 }

@@ -29,8 +29,11 @@ const LINEAR: f64 = 0.1;
 /// Density of the white force that moves a held part beside what was read \[N²·s\]: a sensor of .1 N at
 /// 125 Hz.
 pub(super) const FORCE_DENSITY: f64 = 0.1 * 0.1 * 0.008;
-/// Standard deviation of the unexplained force in units of the joint's friction.
+/// Standard deviation of the unexplained force in units of the joint's friction ...
 const DISTURBANCE: f64 = 0.1;
+/// ... and how much of the unease raises its variance. No more than the friction itself goes unexplained:
+/// what it holds, it goes on holding.
+const MOST_DISTURBED: f64 = 9.0;
 /// Logarithms of friction, damping and inertia wander by this in a second.
 const NUMBER_DRIFT: f64 = 0.02;
 /// The posterior's logarithms are not trusted beyond this, nor carry a linearization further than that.
@@ -483,7 +486,8 @@ impl Filter {
             self.disturbance[joint] *= faded;
             self.covariance.row_mut(at).scale_mut(faded);
             self.covariance.column_mut(at).scale_mut(faded);
-            let stationary = (DISTURBANCE * self.tree.bodies()[joint].parameters.friction).powi(2) * self.unease;
+            let friction = self.tree.bodies()[joint].parameters.friction;
+            let stationary = (DISTURBANCE * friction).powi(2) * self.unease.min(MOST_DISTURBED);
             self.covariance[(at, at)] += stationary * (1.0 - faded * faded);
         }
     }
@@ -627,7 +631,9 @@ impl Filter {
         for joint in 0..n {
             self.state.positions[joint] += change[joint];
             self.state.rates[joint] += change[n + joint];
-            self.disturbance[joint] += change[2 * n + 3 + joint];
+            let friction = self.tree.bodies()[joint].parameters.friction;
+            let disturbance = self.disturbance[joint] + change[2 * n + 3 + joint];
+            self.disturbance[joint] = disturbance.clamp(-friction, friction);
         }
         self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
         if let Some(held) = &mut self.held {

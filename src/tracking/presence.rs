@@ -16,6 +16,9 @@ const NEWEST: f64 = 0.4;
 /// Excess beyond which no account holds.
 const LOST: f64 = 0.6;
 
+/// What an account that is lost loses beside its excess: costs are truncated, and all lost poses alike.
+const LOG_LOST: f64 = -6.0;
+
 /// What may say where a part is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Account {
@@ -78,7 +81,8 @@ impl Presence {
     /// Probability of each account among those that `there` are.
     pub fn weights(&self, there: [bool; 3]) -> [f64; 3] {
         let logs = Account::ALL.map(|account| {
-            let own = account.log_prior() - INDEPENDENT * self.excess(account).unwrap_or(0.0);
+            let lost = if self.is_lost(account) { LOG_LOST } else { 0.0 };
+            let own = account.log_prior() + lost - INDEPENDENT * self.excess(account).unwrap_or(0.0);
             if there[account as usize] { own } else { f64::NEG_INFINITY }
         });
         let top = logs.iter().copied().fold(f64::NEG_INFINITY, f64::max);
