@@ -93,6 +93,9 @@ impl Whereabouts {
                 told.insert(label, unseen);
                 continue;
             };
+            // A pose that puts the part beyond its own size from its points is none.
+            let mean = scan.iter().map(|p| p.point_in_world).sum::<Vector3<f64>>() / scan.len() as f64;
+            let joint = joint.filter(|pose| (pose.transform_point(&model.centroid) - mean).norm() < 3.0 * model.radius);
             let tool = toucher.track_of(label).filter(|_| learner.use_tool).unwrap_or(&[]);
             let usual = learner.baselines.get(&label).map_or(0.0, |baseline| baseline.cost);
             let presence = self.presences.entry(label).or_default();

@@ -16,8 +16,8 @@ const MOST: f64 = 25.0;
 const NOISE: f64 = 0.002;
 /// Least and greatest scale of the variance.
 const BOUNDS: (f64, f64) = (0.25, 25.0);
-/// Standard deviation down to which a part at rest can show that less would do \[m\].
-const SELF_AGREEMENT: f64 = 0.005;
+/// Standard deviation below which agreement shows nothing: registration's error that frames share \[m\].
+const SHARED_ERROR: f64 = 0.004;
 
 /// The scales of one object's predictions.
 #[derive(Clone, Copy, Debug)]
@@ -57,13 +57,13 @@ impl<const HORIZONS: usize> Calibration<HORIZONS> {
         *count = FADING * *count + 1.0;
     }
 
-    /// What to scale a covariance \[m²\] by. A part at rest agrees with itself to a millimetre or two,
-    /// wrong or not: its spread is not lowered below that.
+    /// What to scale a covariance \[m²\] by. What a part's places have in error all alike does not show in
+    /// how they agree: no spread is lowered below that.
     pub fn scale(&self, kind: Kind, horizon: usize, covariance: &Matrix3<f64>) -> f64 {
         let (sum, count) = self.sums[kind.index()][horizon];
         let shown = ((PRIOR + sum) / (PRIOR + count)).clamp(BOUNDS.0, BOUNDS.1);
         let own = covariance.trace() / 3.0;
-        if kind.moves || shown > 1.0 || own <= 0.0 { shown } else { shown.max((SELF_AGREEMENT.powi(2) / own).min(1.0)) }
+        if shown > 1.0 || own <= 0.0 { shown } else { shown.max((SHARED_ERROR.powi(2) / own).min(1.0)) }
     }
 }
 

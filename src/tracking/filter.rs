@@ -181,6 +181,11 @@ impl Filter {
         &self.state.rates
     }
 
+    /// The dynamics' numbers as the tool's track has moved them.
+    pub fn numbers(&self) -> &DVector<f64> {
+        &self.numbers
+    }
+
     /// What the tool holds.
     pub fn held(&self) -> Option<Held> {
         self.held
@@ -611,7 +616,15 @@ impl Filter {
             inverse = wider;
         }
         let inverse = DMatrix::from_column_slice(6, 6, inverse.as_slice());
+        let before = self.state.rates.clone();
         self.correct(&jacobian, &inverse, &DVector::from_column_slice(innovation.as_slice()));
+        // What nothing drives does not speed up because a scan was matched elsewhere.
+        let driven = self.held.map(|held| self.mechanism.chain(held.body)).unwrap_or_default();
+        for joint in (0..n).filter(|joint| !driven.contains(joint)) {
+            let most = before[joint].abs();
+            self.state.rates[joint] = self.state.rates[joint].clamp(-most, most);
+        }
+        self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
     }
 
     /// x ← x + K z, K = P Hᵀ S⁻¹; where the numbers are only considered their rows of K are zero

@@ -24,7 +24,7 @@ const COARSE_STEP: f64 = 0.008;
 const STOP_BEYOND: f64 = 0.25;
 /// ... and the chance that where it was first seen is itself a stop: things are mostly found closed.
 const FOUND_CLOSED: f64 = 0.5;
-/// Nothing predicted speeds up by more than this \[m/s\].
+/// Nothing predicted is faster than this, nor speeds up by more \[m/s\].
 const FASTEST: f64 = 1.5;
 
 /// One part at one horizon.
@@ -151,7 +151,8 @@ impl Filter {
         let mut workspace = Workspace::new(&tree);
         let mut cursor = 0;
         let first = self.state.positions.clone();
-        let speeds: Vec<f64> = self.state.rates.iter().map(|rate| rate.abs()).collect();
+        let speed = |joint: usize| self.state.rates[joint].abs().min(FASTEST / self.mechanism.reach(joint));
+        let speeds: Vec<f64> = (0..first.len()).map(speed).collect();
         let mut path = vec![state.positions.clone()];
         for span in times_s.windows(2) {
             drive.run(&mut tree, &mut state, [span[0], span[1]], &disturbance, (&mut workspace, &mut cursor));
