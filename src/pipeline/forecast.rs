@@ -11,7 +11,7 @@ use nalgebra::{Matrix3, Vector3};
 use super::explain::{measure, travel};
 use super::touch::{Touch, Toucher, first_push};
 use super::whereabouts::{Told, Whereabouts};
-use super::{Frame, Learner, Output};
+use super::{Frame, Learner, Output, PipelineSettings};
 use crate::math::Pose;
 use crate::mechanism::WrenchSample;
 use crate::registration::AlignmentSettings;
@@ -62,6 +62,21 @@ struct Waiting {
     displacements: BTreeMap<Label, Pose>,
 }
 
+impl Waiting {
+    /// Starts at `time_s` from the displacements that the parts have then, at rest.
+    fn start_from(&mut self, time_s: f64, displacements: &BTreeMap<Label, Pose>) {
+        self.start_s = time_s;
+        self.displacements.extend(displacements.iter().map(|(label, displacement)| (*label, *displacement)));
+        self.rates.fill(0.0);
+        let Some(mechanism) = &self.mechanism else { return };
+        let seen = |label: Label| displacements.get(&label).copied().unwrap_or_else(Pose::identity);
+        for (joint, position) in mechanism.joints.iter().zip(&mut self.positions) {
+            let parent = joint.parent.map_or_else(Pose::identity, |parent| seen(mechanism.joints[parent].child));
+            *position = joint.position_of(&(parent.inverse() * seen(joint.child)), *position);
+        }
+    }
+}
+
 /// What a stamp brought.
 struct Seen {
     time_s: f64,
@@ -97,6 +112,7 @@ struct Issued {
 /// From the stream as it comes to predictions.
 pub(super) struct Forecaster {
     latency_s: f64,
+    live: bool,
     early: Vec<AppliedWrench>,
     zero: Option<Stamp>,
     samples: Vec<WrenchSample>,
@@ -118,14 +134,17 @@ pub(super) struct Forecaster {
     seen: VecDeque<Seen>,
     labels: BTreeSet<Label>,
     pending: VecDeque<Pending>,
+    /// What predictions of the last second were made from.
+    past: VecDeque<Pending>,
     root: Option<Label>,
 }
 
 impl Forecaster {
-    /// Nothing seen; a posterior counts from its window's close plus `latency_s`.
-    pub fn new(root: Option<Label>, latency_s: f64) -> Self {
+    /// Nothing seen; a posterior counts from its window's close plus the latency.
+    pub fn new(settings: &PipelineSettings) -> Self {
         Self {
-            latency_s,
+            latency_s: settings.posterior_latency_s,
+            live: settings.live,
             early: Vec::new(),
             zero: None,
             samples: Vec::new(),
@@ -144,7 +163,8 @@ impl Forecaster {
             seen: VecDeque::new(),
             labels: BTreeSet::new(),
             pending: VecDeque::new(),
-            root,
+            past: VecDeque::new(),
+            root: settings.root,
         }
     }
 
@@ -171,8 +191,9 @@ impl Forecaster {
         self.ready(|pending| sample.stamp_s >= pending.time_s + HORIZONS[2])
     }
 
-    /// What a window taught, to count from its close \[s\] plus the latency.
-    pub fn learned(&mut self, learner: &Learner) {
+    /// What a window taught, to count from its close \[s\] plus the latency. Where the stream went
+    /// on meanwhile, `current` is where the parts are by now: the filter starts from there.
+    pub fn learned(&mut self, learner: &Learner, current: Option<&BTreeMap<Label, Pose>>) {
         let (Some(close_s), Some(window)) =
             (learner.windows.last().and_then(|w| w.times_s.last()).copied(), learner.windows.last())
         else {
@@ -194,13 +215,33 @@ impl Forecaster {
             }
         }
         self.root = Some(learner.root);
-        self.waiting.push(Waiting {
+        let mut new = Waiting {
             from_s: close_s + self.latency_s,
             mechanism: mechanism.map(Arc::new),
             start_s: window.times_s[start],
             close_s,
             positions,
             rates,
+            displacements: learner.displacements.clone(),
+        };
+        if let (Some(current), Some(last)) = (current, self.seen.back()) {
+            new.start_from(last.time_s, current);
+        }
+        self.waiting.push(new);
+    }
+
+    /// Starts from a saved object whose joints are at `positions` now.
+    pub fn resumed(&mut self, learner: &Learner, now_s: f64, positions: Vec<f64>) {
+        let noise_scale = learner.inferences.last().map_or(1.0, |inference| inference.noise_scale);
+        let mechanism = learner.fit.as_ref().and_then(|fit| TrackedMechanism::new(fit, &learner.dynamics, noise_scale));
+        self.root = Some(learner.root);
+        self.waiting.push(Waiting {
+            from_s: now_s,
+            mechanism: mechanism.map(Arc::new),
+            start_s: now_s,
+            close_s: now_s,
+            rates: vec![0.0; positions.len()],
+            positions,
             displacements: learner.displacements.clone(),
         });
     }
@@ -260,6 +301,11 @@ impl Forecaster {
             skills: self.skills.clone(),
             rest_force,
         });
+        if self.live {
+            // The last reading stands for those to come.
+            outputs.extend(self.ready(|_| true));
+            return outputs;
+        }
         let newest_s = self.samples.last().map_or(f64::NEG_INFINITY, |s| s.stamp_s);
         outputs.extend(self.ready(|pending| {
             newest_s >= pending.time_s + HORIZONS[2] || now_s > pending.time_s + HORIZONS[2] + PATIENCE
@@ -309,6 +355,10 @@ impl Forecaster {
         let mut outputs = Vec::new();
         while let Some(pending) = self.pending.pop_front_if(|pending| is_ready(pending)) {
             self.predict(&pending, &mut outputs);
+            while self.past.front().is_some_and(|past| past.time_s < pending.time_s - HORIZONS[1] - SAME_STAMP) {
+                self.past.pop_front();
+            }
+            self.past.push_back(pending);
         }
         outputs
     }
@@ -418,7 +468,8 @@ impl Forecaster {
         let Some(learner) = learner else { return };
         for (slot, (horizon, _)) in JUDGED.into_iter().enumerate() {
             let then_s = now_s - HORIZONS[horizon];
-            let Some(pending) = self.pending.iter().find(|p| (p.time_s - then_s).abs() < SAME_STAMP) else { continue };
+            let mut made = self.pending.iter().chain(&self.past);
+            let Some(pending) = made.find(|p| (p.time_s - then_s).abs() < SAME_STAMP) else { continue };
             let Some(filter) = &pending.filter else { continue };
             let simulated = filter.expect(now_s, &self.samples);
             let steady = filter.steady(&[now_s - pending.time_s]);

@@ -58,8 +58,7 @@ pub fn mix(
     }
     let to_center = Pose::from_translation(*center);
     let between = ((first.0 * to_center).inverse() * second.0 * to_center).log();
-    let displacement =
-        first.0 * to_center * Pose::exp(&(between * (1.0 - weight))) * Pose::from_translation(-center);
+    let displacement = first.0 * to_center * Pose::exp(&(between * (1.0 - weight))) * Pose::from_translation(-center);
     let apart = first.0.transform_point(center) - second.0.transform_point(center);
     let covariance =
         first.1 * weight + second.1 * (1.0 - weight) + apart * apart.transpose() * (weight * (1.0 - weight));
@@ -113,7 +112,8 @@ impl Filter {
     /// Where each part is expected at a later time under the wrenches read.
     pub fn expect(&self, time_s: f64, samples: &[WrenchSample]) -> BTreeMap<Label, Pose> {
         let first = samples.partition_point(|s| s.stamp_s < self.time_s - 0.05);
-        let path = if self.rests() { None } else { self.simulate(&[], &[self.time_s, time_s], &samples[first..], STEP) };
+        let path =
+            if self.rests() { None } else { self.simulate(&[], &[self.time_s, time_s], &samples[first..], STEP) };
         let positions = path.and_then(|mut path| path.pop()).unwrap_or_else(|| self.state.positions.clone());
         self.placed(&self.before_unknown_stops(&positions).0)
     }
@@ -184,10 +184,8 @@ impl Filter {
             coordinates.extend(2 * n..2 * n + 3);
         }
         coordinates.retain(|&at| self.covariance[(at, at)] > 1e-16);
-        let deviations = DVector::from_iterator(
-            coordinates.len(),
-            coordinates.iter().map(|&at| self.covariance[(at, at)].sqrt()),
-        );
+        let deviations =
+            DVector::from_iterator(coordinates.len(), coordinates.iter().map(|&at| self.covariance[(at, at)].sqrt()));
         let correlation = DMatrix::from_fn(coordinates.len(), coordinates.len(), |i, j| {
             self.covariance[(coordinates[i], coordinates[j])] / (deviations[i] * deviations[j])
         });
@@ -248,9 +246,8 @@ impl Filter {
     /// Variance of a joint's position by the unmodelled force over a span: ∫∫ of white acceleration.
     fn unmodelled(&self, joint: usize, span_s: f64) -> f64 {
         let inertia = self.inertia(joint);
-        let density =
-            FORCE_DENSITY * self.mechanism.noise_scale * self.unease * self.mechanism.reach(joint).powi(2)
-                / inertia.powi(2);
+        let density = FORCE_DENSITY * self.mechanism.noise_scale * self.unease * self.mechanism.reach(joint).powi(2)
+            / inertia.powi(2);
         density * span_s.powi(3) / 3.0
     }
 }

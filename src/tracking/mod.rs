@@ -10,6 +10,7 @@ mod forecast;
 mod free;
 mod mechanism;
 mod presence;
+mod score;
 mod simulation;
 mod skill;
 #[cfg(test)]
@@ -19,6 +20,7 @@ pub use calibration::{Calibration, Kind};
 pub use filter::{Filter, Held};
 pub use forecast::{Forecast, mix};
 pub use free::FreePart;
-pub use presence::{Account, Presence};
-pub use skill::Skill;
 pub use mechanism::{ActiveNumber, TrackedMechanism, TreeFamily};
+pub use presence::{Account, Presence};
+pub use score::{MeasuredPath, ResidualSum};
+pub use skill::Skill;

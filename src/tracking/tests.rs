@@ -16,7 +16,7 @@ use crate::types::Label;
 const CONTACT: Vector3<f64> = Vector3::new(0.5, 0.0, 0.2);
 
 /// A drawer along x of 3 kg.
-fn drawer(damping: f64) -> TrackedMechanism {
+pub(super) fn drawer(damping: f64) -> TrackedMechanism {
     let axis = Axis { direction: Vector3::x(), point: Vector3::zeros() };
     let joint = KinematicJoint {
         parent: None,
@@ -50,7 +50,7 @@ fn drawer(damping: f64) -> TrackedMechanism {
 }
 
 /// Readings at 125 Hz of a pull that varies, with no noise: a test needs no luck.
-fn readings() -> Vec<WrenchSample> {
+pub(super) fn readings() -> Vec<WrenchSample> {
     (0..250)
         .map(|i| {
             let stamp_s = f64::from(i) * 0.008;
@@ -65,7 +65,7 @@ fn readings() -> Vec<WrenchSample> {
         .collect()
 }
 
-fn truth(tree: &Tree<f64>, samples: &[WrenchSample], times_s: &[f64]) -> Vec<(f64, f64)> {
+pub(super) fn truth(tree: &Tree<f64>, samples: &[WrenchSample], times_s: &[f64]) -> Vec<(f64, f64)> {
     let track = WrenchTrack { point: WrenchPoint::Carried(CONTACT), ..WrenchTrack::new(0, samples) };
     let path = rollout(tree, &State::at_rest(1), &[track], times_s, 0.001).unwrap();
     (0..times_s.len()).map(|i| (path.positions(i)[0], path.rates(i)[0])).collect()
