@@ -8,22 +8,20 @@ use std::sync::Arc;
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::explain::{FEWEST_POINTS, measure, travel};
-use super::{Frame, Learner, Output, PipelineSettings, nearest_label};
+use super::explain::{measure, travel};
+use super::touch::{Touch, Toucher, first_push};
+use super::whereabouts::{Told, Whereabouts};
+use super::{Frame, Learner, Output, PipelineSettings};
 use crate::math::Pose;
 use crate::mechanism::WrenchSample;
 use crate::registration::AlignmentSettings;
-use crate::tracking::{Filter, FreePart, TrackedMechanism};
+use crate::tracking::{Calibration, Filter, FreePart, Kind, Skill, TrackedMechanism, mix};
 use crate::types::{AppliedWrench, Label, Stamp};
 
 /// How far ahead \[s\].
 const HORIZONS: [f64; 3] = [0.1, 0.5, 1.0];
 /// Readings may be this much coarser than the last horizon before a prediction waits no longer \[s\].
 const PATIENCE: f64 = 0.3;
-/// Half the readings that a force is smoothed over.
-const SMOOTHING: usize = 4;
-/// Contact outlives the force by this \[s\].
-const RELEASE: f64 = 0.2;
 /// Points further from the surface where it is expected say nothing \[m\].
 const POSE_GATE: f64 = 0.03;
 /// A part that went less from one frame to the next has come to rest \[m\].
@@ -38,14 +36,27 @@ const FIT_DEVIATION: (f64, f64) = (0.0015, 0.03);
 const FIT_RESTS: f64 = 0.004;
 /// Standard deviation of the root, of which all is said relative to itself \[m\].
 const ROOT_DEVIATION: f64 = 0.0005;
-/// Least and first standard deviation of the tool's reported position \[m\].
-const TOOL_SIGMA: (f64, f64) = (0.0002, 0.001);
+/// Predictions that are judged soon after they were made, to weigh the ways to predict: their horizons,
+/// and what error is no fault of a way there \[m\].
+const JUDGED: [(usize, f64); 2] = [(0, 0.004), (1, 0.015)];
+/// Stamps that differ by less than this are the same \[s\].
+const SAME_STAMP: f64 = 0.02;
+/// A part said to go further than this moves \[m\].
+const MOVES: f64 = 0.003;
+/// The tool is about to touch what it is near to, this near \[m\] ...
+const APPROACH: f64 = 0.25;
+/// ... with this probability, at the point nearest to it but for so much \[m\].
+const TOUCHES: f64 = 0.85;
+const TOUCH_DEVIATION: f64 = 0.04;
+/// A part of unknown joint that is about to be pushed goes at this speed, or does not \[m/s\].
+const PUSHED: f64 = 0.15;
 
 /// A posterior that does not count yet.
 struct Waiting {
     from_s: f64,
     mechanism: Option<Arc<TrackedMechanism>>,
     start_s: f64,
+    close_s: f64,
     positions: Vec<f64>,
     rates: Vec<f64>,
     displacements: BTreeMap<Label, Pose>,
@@ -66,17 +77,6 @@ impl Waiting {
     }
 }
 
-/// One reading in contact.
-#[derive(Clone, Copy, Debug)]
-struct Touch {
-    time_s: f64,
-    tool_in_world: Vector3<f64>,
-    /// The part, and whether contact with it begins here.
-    part: Option<Label>,
-    begins: bool,
-    pushes: bool,
-}
-
 /// What a stamp brought.
 struct Seen {
     time_s: f64,
@@ -85,46 +85,57 @@ struct Seen {
     tool_sigma: f64,
 }
 
-/// A contact under way.
-struct ContactNow {
-    label: Option<Label>,
-    votes: BTreeMap<Label, usize>,
-    last_push_s: f64,
-    track: Vec<(f64, Vector3<f64>)>,
-    from: Pose,
-}
-
 /// What predictions for a stamp are made from.
 struct Pending {
     time_s: f64,
     filter: Option<Filter>,
-    free: BTreeMap<Label, FreePart>,
+    told: BTreeMap<Label, Told>,
     root: Option<Label>,
+    /// What the tool is near to, and the point of it, if it touches nothing.
+    near: Option<(Label, Vector3<f64>)>,
+    calibration: Calibration<3>,
+    skills: BTreeMap<Label, [Skill; JUDGED.len()]>,
+    rest_force: Vector3<f64>,
+}
+
+/// A prediction to be judged.
+struct Issued {
+    target_s: f64,
+    horizon: usize,
+    label: Label,
+    center: Vector3<f64>,
+    kind: Kind,
+    expected: Vector3<f64>,
+    covariance_m2: Matrix3<f64>,
 }
 
 /// From the stream as it comes to predictions.
 pub(super) struct Forecaster {
     latency_s: f64,
     live: bool,
-    use_tool: bool,
     early: Vec<AppliedWrench>,
     zero: Option<Stamp>,
     samples: Vec<WrenchSample>,
-    bound: Option<Label>,
     source: Option<usize>,
     filter: Option<Filter>,
     denials: usize,
     /// Moving parts as measured in the frame before.
     last: BTreeMap<Label, Pose>,
-    contact: Option<ContactNow>,
-    /// Readings looked at for contact, in time.
-    looked_s: f64,
-    tool_variance: f64,
+    toucher: Toucher,
+    whereabouts: Whereabouts,
+    told: BTreeMap<Label, Told>,
+    /// Where parts were found, by time.
+    found: BTreeMap<Label, Vec<(f64, Pose)>>,
+    /// Predictions that are not yet judged.
+    issued: VecDeque<Issued>,
+    calibration: Calibration<3>,
+    skills: BTreeMap<Label, [Skill; JUDGED.len()]>,
     waiting: Vec<Waiting>,
     seen: VecDeque<Seen>,
     labels: BTreeSet<Label>,
-    places: BTreeMap<Label, FreePart>,
     pending: VecDeque<Pending>,
+    /// What predictions of the last second were made from.
+    past: VecDeque<Pending>,
     root: Option<Label>,
 }
 
@@ -134,23 +145,25 @@ impl Forecaster {
         Self {
             latency_s: settings.posterior_latency_s,
             live: settings.live,
-            use_tool: settings.use_tool,
             early: Vec::new(),
             zero: None,
             samples: Vec::new(),
-            bound: None,
             source: None,
             filter: None,
             denials: 0,
             last: BTreeMap::new(),
-            contact: None,
-            looked_s: f64::NEG_INFINITY,
-            tool_variance: TOOL_SIGMA.1.powi(2),
+            toucher: Toucher::default(),
+            whereabouts: Whereabouts::default(),
+            told: BTreeMap::new(),
+            found: BTreeMap::new(),
+            issued: VecDeque::new(),
+            calibration: Calibration::default(),
+            skills: BTreeMap::new(),
             waiting: Vec::new(),
             seen: VecDeque::new(),
             labels: BTreeSet::new(),
-            places: BTreeMap::new(),
             pending: VecDeque::new(),
+            past: VecDeque::new(),
             root: settings.root,
         }
     }
@@ -164,7 +177,7 @@ impl Forecaster {
         if *self.source.get_or_insert(wrench.source) != wrench.source {
             return Vec::new();
         }
-        self.bound = wrench.part.or(self.bound);
+        self.toucher.bound = wrench.part.or(self.toucher.bound);
         let sample = WrenchSample {
             stamp_s: wrench.stamp.seconds_since(zero),
             point_in_world: wrench.point_in_world,
@@ -206,6 +219,7 @@ impl Forecaster {
             from_s: close_s + self.latency_s,
             mechanism: mechanism.map(Arc::new),
             start_s: window.times_s[start],
+            close_s,
             positions,
             rates,
             displacements: learner.displacements.clone(),
@@ -225,6 +239,7 @@ impl Forecaster {
             from_s: now_s,
             mechanism: mechanism.map(Arc::new),
             start_s: now_s,
+            close_s: now_s,
             rates: vec![0.0; positions.len()],
             positions,
             displacements: learner.displacements.clone(),
@@ -243,18 +258,39 @@ impl Forecaster {
         let early = std::mem::take(&mut self.early);
         let mut outputs: Vec<Output> = early.iter().flat_map(|wrench| self.push_wrench(wrench)).collect();
         self.labels.extend(frame.scans.keys());
-        let touches = self.touches(&frame, &rest_force);
+        let touches = self.toucher.touches(&self.samples, &frame, &rest_force);
         let now_s = frame.time_s;
-        let seen = Seen { time_s: now_s, frame, touches, tool_sigma: self.tool_variance.sqrt().max(TOOL_SIGMA.0) };
-        self.seen.push_back(seen);
+        let tool_sigma = self.toucher.tool_sigma();
+        self.seen.push_back(Seen { time_s: now_s, frame, touches, tool_sigma });
         if !self.restart(now_s, learner)
             && let (Some(filter), Some(seen)) = (&mut self.filter, self.seen.back())
         {
             follow(filter, seen, &self.samples, learner, (&mut self.denials, &mut self.last));
         }
+        let mut told = BTreeMap::new();
+        if let Some(seen) = self.seen.back() {
+            let (frame, toucher) = (&seen.frame, &self.toucher);
+            told = self.whereabouts.look(frame, &self.labels, learner, self.filter.as_ref(), toucher);
+            if let (Some(learner), Some(filter)) = (learner, &mut self.filter) {
+                self.whereabouts.relocate(frame, learner, filter);
+            }
+            for label in self.toucher.let_go() {
+                self.whereabouts.leave(label);
+            }
+        }
+        self.told.clone_from(&told);
+        self.judge(now_s, &told, learner);
         self.forget(now_s);
-        let free = self.free_parts();
-        self.pending.push_back(Pending { time_s: now_s, filter: self.filter.clone(), free, root: self.root });
+        self.pending.push_back(Pending {
+            time_s: now_s,
+            filter: self.filter.clone(),
+            told,
+            root: self.root,
+            near: self.toucher.near(APPROACH),
+            calibration: self.calibration,
+            skills: self.skills.clone(),
+            rest_force,
+        });
         if self.live {
             // The last reading stands for those to come.
             outputs.extend(self.ready(|_| true));
@@ -269,7 +305,8 @@ impl Forecaster {
 
     /// What is known now: the joints, the parts by themselves, the last frame. `None` without a joint.
     pub fn knowledge(&self) -> Option<(Filter, BTreeMap<Label, FreePart>, Frame)> {
-        Some((self.filter.clone()?, self.free_parts(), self.seen.back()?.frame.clone()))
+        let free = self.told.iter().map(|(label, told)| (*label, told.free.clone())).collect();
+        Some((self.filter.clone()?, free, self.seen.back()?.frame.clone()))
     }
 
     /// The rest, at the end of the stream.
@@ -281,7 +318,7 @@ impl Forecaster {
     fn restart(&mut self, now_s: f64, learner: Option<&Learner>) -> bool {
         let Some(at) = self.waiting.iter().rposition(|waiting| waiting.from_s <= now_s + 1e-9) else { return false };
         let Some(new) = self.waiting.drain(..=at).next_back() else { return false };
-        self.places = new.displacements.into_iter().map(|(label, place)| (label, FreePart::resting(place))).collect();
+        self.whereabouts.restart(new.displacements);
         self.denials = 0;
         let Some(mechanism) = new.mechanism else {
             self.filter = None;
@@ -289,94 +326,12 @@ impl Forecaster {
         };
         let mut filter = Filter::new(mechanism, new.start_s, new.positions, new.rates, FIT_DEVIATION);
         for seen in self.seen.iter().filter(|seen| seen.time_s > new.start_s + 1e-9) {
+            filter.set_adapting(seen.time_s > new.close_s);
             follow(&mut filter, seen, &self.samples, learner, (&mut self.denials, &mut self.last));
         }
+        filter.set_adapting(true);
         self.filter = Some(filter);
         true
-    }
-
-    /// Readings since the last frame that are in contact, by part.
-    fn touches(&mut self, frame: &Frame, rest_force: &Vector3<f64>) -> Vec<Touch> {
-        let first = self.samples.partition_point(|s| s.stamp_s <= self.looked_s);
-        let end = self.samples.partition_point(|s| s.stamp_s <= frame.time_s + 1e-9);
-        self.looked_s = frame.time_s;
-        let mut touches = Vec::new();
-        let tool_now = (end > first).then(|| self.samples[end - 1].point_in_world);
-        let nearest = self.bound.or_else(|| nearest_label(&tool_now?, frame));
-        let mut voted = false;
-        for i in first..end {
-            let around = &self.samples[i.saturating_sub(SMOOTHING)..(i + SMOOTHING + 1).min(end)];
-            let mean = around.iter().map(|s| s.force_in_world).sum::<Vector3<f64>>() / around.len() as f64;
-            let pushes = (mean - rest_force).norm() > 0.3;
-            let sample = self.samples[i];
-            if i >= 3 {
-                // Third differences of white noise have 20 times its variance; of a motion, next to none.
-                let x = |k: usize| self.samples[i - k].point_in_world;
-                let third = (x(0) - x(1) * 3.0 + x(2) * 3.0 - x(3)).norm_squared() / 60.0;
-                self.tool_variance += 0.005 * (third.min(4.0 * self.tool_variance) - self.tool_variance);
-            }
-            if self.contact.as_ref().is_some_and(|c| !pushes && sample.stamp_s - c.last_push_s > RELEASE) {
-                self.end_contact();
-            }
-            if self.contact.is_none() && !pushes {
-                continue;
-            }
-            let mut begins = self.contact.is_none();
-            let contact = self.contact.get_or_insert_with(|| ContactNow {
-                label: None,
-                votes: BTreeMap::new(),
-                last_push_s: sample.stamp_s,
-                track: Vec::new(),
-                from: Pose::identity(),
-            });
-            if pushes {
-                contact.last_push_s = sample.stamp_s;
-            }
-            if !std::mem::replace(&mut voted, true)
-                && let Some(label) = nearest
-            {
-                *contact.votes.entry(label).or_default() += 1;
-                let most = contact.votes.iter().max_by_key(|(_, votes)| **votes).map(|(label, _)| *label);
-                tracing::debug!(time_s = frame.time_s, ?nearest, ?most, "touch");
-                if contact.label != most {
-                    begins = true;
-                    contact.label = most;
-                    contact.track.clear();
-                    contact.from =
-                        most.and_then(|l| self.places.get(&l)).map_or_else(Pose::identity, |place| place.displacement);
-                }
-            }
-            contact.track.push((sample.stamp_s, sample.point_in_world));
-            touches.push(Touch {
-                time_s: sample.stamp_s,
-                tool_in_world: sample.point_in_world,
-                part: contact.label,
-                begins,
-                pushes,
-            });
-        }
-        touches
-    }
-
-    fn end_contact(&mut self) {
-        let Some(contact) = self.contact.take() else { return };
-        if let Some(label) = contact.label {
-            let end = FreePart::carried(contact.from, &contact.track);
-            self.places.insert(label, FreePart { velocity: None, ..end });
-        }
-    }
-
-    /// The parts that have no joint yet.
-    fn free_parts(&self) -> BTreeMap<Label, FreePart> {
-        self.labels
-            .iter()
-            .map(|label| {
-                let place = || self.places.get(label).cloned().unwrap_or_else(|| FreePart::resting(Pose::identity()));
-                let held = self.contact.as_ref().filter(|contact| self.use_tool && contact.label == Some(*label));
-                let part = held.map_or_else(place, |contact| FreePart::carried(contact.from, &contact.track));
-                (*label, part)
-            })
-            .collect()
     }
 
     fn forget(&mut self, now_s: f64) {
@@ -396,33 +351,147 @@ impl Forecaster {
         let mut outputs = Vec::new();
         while let Some(pending) = self.pending.pop_front_if(|pending| is_ready(pending)) {
             self.predict(&pending, &mut outputs);
+            while self.past.front().is_some_and(|past| past.time_s < pending.time_s - HORIZONS[1] - SAME_STAMP) {
+                self.past.pop_front();
+            }
+            self.past.push_back(pending);
         }
         outputs
     }
 
-    fn predict(&self, pending: &Pending, outputs: &mut Vec<Output>) {
-        let forecasts =
-            pending.filter.as_ref().map(|filter| filter.forecast(&HORIZONS, &self.samples)).unwrap_or_default();
-        for label in pending.free.keys() {
+    fn predict(&mut self, pending: &Pending, outputs: &mut Vec<Output>) {
+        let jointed = self.by_joints(pending);
+        let pushed_s = pending.near.and_then(|_| self.next_push(pending));
+        for (label, told) in &pending.told {
+            let root = pending.root == Some(*label);
+            let center = jointed.get(label).map_or_else(Vector3::zeros, |ways| ways.center);
+            let center = told.free.center().unwrap_or(center);
             for (horizon, horizon_s) in HORIZONS.into_iter().enumerate() {
-                let jointed = forecasts.iter().find(|f| f.label == *label && f.horizon == horizon);
-                let (displacement, covariance_m2) = match jointed {
-                    _ if pending.root == Some(*label) => {
-                        (Pose::identity(), Matrix3::from_diagonal_element(ROOT_DEVIATION.powi(2)))
-                    }
-                    Some(forecast) => (forecast.displacement, forecast.covariance_m2),
-                    None => pending.free[label].after(horizon_s),
+                let mut free = told.free.after(horizon_s);
+                if pending.near.is_some_and(|(near, _)| near == *label) {
+                    let way = PUSHED * (horizon_s - pushed_s.map_or(horizon_s, |s| s - pending.time_s)).max(0.0);
+                    free.1 += Matrix3::identity() * (way * way);
+                }
+                let joint = jointed.get(label);
+                let (displacement, covariance) = match joint {
+                    _ if root => (Pose::identity(), Matrix3::from_diagonal_element(ROOT_DEVIATION.powi(2))),
+                    Some(ways) => mix(ways.expected[horizon], free, told.by_joint, &center),
+                    None => free,
                 };
+                let expected = displacement.transform_point(&center);
+                let moves = (expected - told.now.transform_point(&center)).norm() > MOVES;
+                let kind = Kind { by_joint: joint.is_some() && told.by_joint > 0.5, moves };
+                let scale = if root { 1.0 } else { pending.calibration.scale(kind, horizon, &covariance) };
+                if !root {
+                    let target_s = pending.time_s + horizon_s;
+                    let label = *label;
+                    let covariance_m2 = covariance;
+                    self.issued.push_back(Issued { target_s, horizon, label, center, kind, expected, covariance_m2 });
+                }
                 outputs.push(Output::Prediction {
                     time_s: pending.time_s,
                     horizon_s,
                     label: *label,
                     displacement,
-                    covariance_m2,
+                    covariance_m2: covariance * scale,
                 });
             }
         }
     }
+
+    /// Predictions by joints: the mechanism's, its rates' and rest's, as they did of late.
+    fn by_joints(&self, pending: &Pending) -> BTreeMap<Label, Jointed> {
+        let Some(filter) = &pending.filter else { return BTreeMap::new() };
+        let plain = filter.forecast(&HORIZONS, &self.samples);
+        let touched = pending.near.filter(|_| self.next_push(pending).is_some()).and_then(|(label, point)| {
+            let body = filter.mechanism().body(label)?;
+            let mut filter = filter.clone();
+            filter.hold(body, &(point + filter.mechanism().tool_offset), TOUCH_DEVIATION);
+            Some(filter.forecast(&HORIZONS, &self.samples))
+        });
+        let mut jointed: BTreeMap<Label, Jointed> = BTreeMap::new();
+        let steady = filter.steady(&HORIZONS);
+        for (index, forecast) in plain.iter().enumerate() {
+            let mut simulated = (forecast.displacement, forecast.covariance_m2);
+            if let Some(touched) = touched.as_ref().and_then(|touched| touched.get(index)) {
+                let other = (touched.displacement, touched.covariance_m2);
+                simulated = mix(other, simulated, TOUCHES, &forecast.center);
+            }
+            let skill = pending.skills.get(&forecast.label).copied().unwrap_or_default();
+            let judged = forecast.horizon.min(JUDGED.len() - 1);
+            let weights = skill[judged].weights(JUDGED[judged].1);
+            let mut mixed = simulated;
+            if let Some([by_rate, at_rest]) = steady.get(&forecast.label).map(|ways| ways[forecast.horizon])
+                && pending.near.is_none()
+            {
+                let spread = |way: usize| forecast.covariance_m2 + Matrix3::identity() * weights[way].1;
+                let others = weights[1].0 + weights[2].0;
+                let share = weights[1].0 / others.max(1e-12);
+                let other = mix((by_rate, spread(1)), (at_rest, spread(2)), share, &forecast.center);
+                mixed = mix(simulated, other, weights[0].0, &forecast.center);
+            }
+            let entry = jointed
+                .entry(forecast.label)
+                .or_insert_with(|| Jointed { center: forecast.center, expected: [simulated; HORIZONS.len()] });
+            entry.expected[forecast.horizon] = mixed;
+        }
+        jointed
+    }
+
+    /// When the tool first pushes within the horizons after a stamp \[s\].
+    fn next_push(&self, pending: &Pending) -> Option<f64> {
+        let first = self.samples.partition_point(|s| s.stamp_s <= pending.time_s);
+        let end = self.samples.partition_point(|s| s.stamp_s <= pending.time_s + HORIZONS[2] + 1e-9);
+        first_push(&self.samples[first..end.max(first)], &pending.rest_force)
+    }
+
+    /// Judges what was predicted for now, by where the parts are found.
+    fn judge(&mut self, now_s: f64, told: &BTreeMap<Label, Told>, learner: Option<&Learner>) {
+        for (label, told) in told {
+            let found = self.found.entry(*label).or_default();
+            found.push((now_s, told.now));
+            found.retain(|(t, _)| now_s - t < HORIZONS[2] + 1.0);
+        }
+        while let Some(issued) = self.issued.pop_front_if(|issued| issued.target_s < now_s + SAME_STAMP) {
+            let at = self.found.get(&issued.label).and_then(|found| {
+                found.iter().find(|(t, _)| (t - issued.target_s).abs() < SAME_STAMP).map(|(_, pose)| *pose)
+            });
+            if let Some(pose) = at {
+                let error = issued.expected - pose.transform_point(&issued.center);
+                self.calibration.learn(issued.kind, issued.horizon, &error, &issued.covariance_m2);
+            }
+        }
+        let Some(learner) = learner else { return };
+        for (slot, (horizon, _)) in JUDGED.into_iter().enumerate() {
+            let then_s = now_s - HORIZONS[horizon];
+            let mut made = self.pending.iter().chain(&self.past);
+            let Some(pending) = made.find(|p| (p.time_s - then_s).abs() < SAME_STAMP) else { continue };
+            let Some(filter) = &pending.filter else { continue };
+            let simulated = filter.expect(now_s, &self.samples);
+            let steady = filter.steady(&[now_s - pending.time_s]);
+            for (label, told) in told {
+                let (Some(simulated), Some([[by_rate, at_rest]]), Some(model)) =
+                    (simulated.get(label), steady.get(label).map(Vec::as_slice), learner.models.get(label))
+                else {
+                    continue;
+                };
+                let skill = &mut self.skills.entry(*label).or_default()[slot];
+                let center = |pose: &Pose| pose.transform_point(&model.centroid);
+                let errors = [simulated, by_rate, at_rest].map(|pose| (center(pose) - center(&told.now)).norm());
+                if told.by_joint > 0.5 && pending.near.is_none() && errors.iter().any(|error| *error > MOVES) {
+                    skill.learn(errors);
+                } else {
+                    skill.fade();
+                }
+            }
+        }
+    }
+}
+
+/// A part's predictions by joints.
+struct Jointed {
+    center: Vector3<f64>,
+    expected: [(Pose, Matrix3<f64>); HORIZONS.len()],
 }
 
 /// The filter through what one stamp brought.
@@ -474,12 +543,7 @@ fn follow(
     let settings = AlignmentSettings { gate: POSE_GATE, ..AlignmentSettings::default() };
     for (label, displacement) in filter.moving_parts() {
         let (Some(model), Some(scan)) = (learner.models.get(&label), seen.frame.scans.get(&label)) else { continue };
-        let Some(measurement) = measure(model, scan, &displacement, &settings) else {
-            if scan.len() >= FEWEST_POINTS {
-                filter.lose(label);
-            }
-            continue;
-        };
+        let Some(measurement) = measure(model, scan, &displacement, &settings) else { continue };
         filter.correct_by_pose(label, &measurement);
         let (before, after) = (last.get(&label), measurement.displacement);
         still &= before.is_some_and(|before| travel(model, before, &after) < STILL);

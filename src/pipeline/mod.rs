@@ -9,6 +9,8 @@ mod planning;
 mod posterior;
 mod retention;
 mod saved;
+mod touch;
+mod whereabouts;
 mod windows;
 mod worker;
 mod working_frame;

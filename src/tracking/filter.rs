@@ -10,6 +10,7 @@
 //! wrench sensor's noise makes, times κ for what the model misses.
 //! Corrections: x − o = D(q) p by the tool, log(T(−c) D_obs⁻¹ D(q) T(c)) = 0 by every cloud.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, SMatrix, SVector, Vector3, Vector6};
@@ -28,8 +29,11 @@ const LINEAR: f64 = 0.1;
 /// Density of the white force that moves a held part beside what was read \[N²·s\]: a sensor of .1 N at
 /// 125 Hz.
 pub(super) const FORCE_DENSITY: f64 = 0.1 * 0.1 * 0.008;
-/// Standard deviation of the unexplained force in units of the joint's friction.
+/// Standard deviation of the unexplained force in units of the joint's friction ...
 const DISTURBANCE: f64 = 0.1;
+/// ... and how much of the unease raises its variance. No more than the friction itself goes unexplained:
+/// what it holds, it goes on holding.
+const MOST_DISTURBED: f64 = 9.0;
 /// Logarithms of friction, damping and inertia wander by this in a second.
 const NUMBER_DRIFT: f64 = 0.02;
 /// The posterior's logarithms are not trusted beyond this, nor carry a linearization further than that.
@@ -38,6 +42,11 @@ const NUMBER_DEVIATION: (f64, f64) = (0.03, 0.7);
 const STUCK_MEMORY: f64 = 0.03;
 /// Registration error that the frames share \[m\].
 const SHARED_ERROR: f64 = 0.004;
+/// A lost part is looked for along its joint in steps of this \[m\], this far beyond where it was seen
+/// \[m\], at no more places than so many.
+const SEARCH_STEP: f64 = 0.01;
+const SEARCH_BEYOND: f64 = 0.1;
+const MOST_PLACES: usize = 120;
 /// χ² of three or six numbers that no filter in order sees.
 const GATE: f64 = 30.0;
 /// Innovations this much larger than expected, on the mean of the last so many, raise the process noise.
@@ -93,8 +102,6 @@ pub struct Filter {
     surprise: f64,
     /// Joints that what is held does not follow.
     pub(super) distrusted: Vec<bool>,
-    /// Positions at the start.
-    started_at: Vec<f64>,
     /// Least and greatest position of each joint so far.
     pub(super) explored: Vec<[f64; 2]>,
     cursor: usize,
@@ -128,10 +135,8 @@ impl Filter {
             covariance[(i, i)] += NUMBER_DEVIATION.0.powi(2);
         }
         let workspace = Workspace::new(&mechanism.tree);
-        let start = positions.clone();
         let state = State::new(positions, rates);
         Self {
-            started_at: start,
             explored: mechanism.explored.clone(),
             distrusted: vec![false; n],
             disturbance: vec![0.0; n],
@@ -176,6 +181,11 @@ impl Filter {
         &self.state.rates
     }
 
+    /// The dynamics' numbers as the tool's track has moved them.
+    pub fn numbers(&self) -> &DVector<f64> {
+        &self.numbers
+    }
+
     /// What the tool holds.
     pub fn held(&self) -> Option<Held> {
         self.held
@@ -189,14 +199,46 @@ impl Filter {
         (0..self.mechanism.joints.len()).filter(rests).map(|joint| (joint, self.state.positions[joint])).collect()
     }
 
-    /// A part that is not where it should be, with all that carries it, is where the filter started, at rest.
-    pub fn lose(&mut self, label: Label) {
-        let Some(body) = self.mechanism.body(label) else { return };
-        for joint in self.mechanism.chain(body) {
-            self.state.positions[joint] = self.started_at[joint];
-            self.state.rates[joint] = 0.0;
+    /// Displacements of the parts whose joints are trusted.
+    pub fn trusted_parts(&self) -> BTreeMap<Label, Pose> {
+        let displacements = self.mechanism.tree.displacements(&self.state.positions);
+        let joints = self.mechanism.joints.iter().zip(displacements).enumerate();
+        joints
+            .filter(|(body, _)| !self.mechanism.chain(*body).iter().any(|joint| self.distrusted[*joint]))
+            .map(|(_, (joint, displacement))| (joint.child, displacement))
+            .collect()
+    }
+
+    /// Positions of a body's joint all through where it was seen and somewhat beyond, with the body's
+    /// displacement there.
+    pub fn places_along(&self, body: usize) -> Vec<(f64, Pose)> {
+        let [low, high] = self.explored[body];
+        let step = SEARCH_STEP / self.mechanism.reach(body);
+        let beyond = SEARCH_BEYOND / self.mechanism.reach(body);
+        let count = (((high - low + 2.0 * beyond) / step).ceil().max(1.0) as usize).min(MOST_PLACES);
+        let joint = &self.mechanism.joints[body];
+        let displacements = self.mechanism.tree.displacements(&self.state.positions);
+        let above = joint.parent.map_or_else(Pose::identity, |parent| displacements[parent]);
+        (0..=count)
+            .map(|i| low - beyond + (high - low + 2.0 * beyond) * i as f64 / count as f64)
+            .map(|q| (q, above * joint.screw().displacement(q)))
+            .collect()
+    }
+
+    /// Puts a body's joint at a position where it was found, at rest; what holds it must take hold anew.
+    pub fn place(&mut self, body: usize, position: f64) {
+        let n = self.mechanism.joints.len();
+        if self.held.is_some_and(|held| self.mechanism.chain(held.body).contains(&body)) {
+            self.release();
         }
+        self.state.positions[body] = position;
+        self.state.rates[body] = 0.0;
         self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
+        for at in [body, n + body] {
+            self.covariance.row_mut(at).fill(0.0);
+            self.covariance.column_mut(at).fill(0.0);
+        }
+        self.covariance[(body, body)] = (SEARCH_STEP / self.mechanism.reach(body)).powi(2);
     }
 
     /// What moves a body is not as the mechanism says: it stops, and is not forecast.
@@ -449,7 +491,8 @@ impl Filter {
             self.disturbance[joint] *= faded;
             self.covariance.row_mut(at).scale_mut(faded);
             self.covariance.column_mut(at).scale_mut(faded);
-            let stationary = (DISTURBANCE * self.tree.bodies()[joint].parameters.friction).powi(2) * self.unease;
+            let friction = self.tree.bodies()[joint].parameters.friction;
+            let stationary = (DISTURBANCE * friction).powi(2) * self.unease.min(MOST_DISTURBED);
             self.covariance[(at, at)] += stationary * (1.0 - faded * faded);
         }
     }
@@ -573,7 +616,15 @@ impl Filter {
             inverse = wider;
         }
         let inverse = DMatrix::from_column_slice(6, 6, inverse.as_slice());
+        let before = self.state.rates.clone();
         self.correct(&jacobian, &inverse, &DVector::from_column_slice(innovation.as_slice()));
+        // What nothing drives does not speed up because a scan was matched elsewhere.
+        let driven = self.held.map(|held| self.mechanism.chain(held.body)).unwrap_or_default();
+        for joint in (0..n).filter(|joint| !driven.contains(joint)) {
+            let most = before[joint].abs();
+            self.state.rates[joint] = self.state.rates[joint].clamp(-most, most);
+        }
+        self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
     }
 
     /// x ← x + K z, K = P Hᵀ S⁻¹; where the numbers are only considered their rows of K are zero
@@ -593,7 +644,9 @@ impl Filter {
         for joint in 0..n {
             self.state.positions[joint] += change[joint];
             self.state.rates[joint] += change[n + joint];
-            self.disturbance[joint] += change[2 * n + 3 + joint];
+            let friction = self.tree.bodies()[joint].parameters.friction;
+            let disturbance = self.disturbance[joint] + change[2 * n + 3 + joint];
+            self.disturbance[joint] = disturbance.clamp(-friction, friction);
         }
         self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
         if let Some(held) = &mut self.held {

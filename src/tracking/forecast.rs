@@ -5,9 +5,12 @@
 //! force's. Beyond where a joint was ever seen an unknown stop may wait: at distance X, exponential with
 //! mean L, so that a way Δ beyond becomes E min(Δ, X) = L (1 − e^(−Δ/L)), with its variance.
 
+use std::collections::BTreeMap;
+
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 
 use super::filter::{FORCE_DENSITY, Filter, STEP, Start};
+use super::free::FADE;
 use super::mechanism::TrackedMechanism;
 use super::simulation::Drive;
 use crate::math::{Pose, Screw};
@@ -21,7 +24,7 @@ const COARSE_STEP: f64 = 0.008;
 const STOP_BEYOND: f64 = 0.25;
 /// ... and the chance that where it was first seen is itself a stop: things are mostly found closed.
 const FOUND_CLOSED: f64 = 0.5;
-/// Nothing predicted speeds up by more than this \[m/s\].
+/// Nothing predicted is faster than this, nor speeds up by more \[m/s\].
 const FASTEST: f64 = 1.5;
 
 /// One part at one horizon.
@@ -33,8 +36,33 @@ pub struct Forecast {
     pub horizon: usize,
     /// D.
     pub displacement: Pose,
-    /// Covariance of D·c, c its centre of mass \[m²\].
+    /// c, its centre of mass at the reference configuration \[m\].
+    pub center: Vector3<f64>,
+    /// Covariance of D·c \[m²\].
     pub covariance_m2: Matrix3<f64>,
+}
+
+/// The mixture of two predictions of a part with its centre at `center`, the first with probability
+/// `weight`, as one Gaussian of the same mean and covariance; between two turns along the screw.
+pub fn mix(
+    first: (Pose, Matrix3<f64>),
+    second: (Pose, Matrix3<f64>),
+    weight: f64,
+    center: &Vector3<f64>,
+) -> (Pose, Matrix3<f64>) {
+    if weight > 0.9999 {
+        return first;
+    }
+    if weight < 0.0001 {
+        return second;
+    }
+    let to_center = Pose::from_translation(*center);
+    let between = ((first.0 * to_center).inverse() * second.0 * to_center).log();
+    let displacement = first.0 * to_center * Pose::exp(&(between * (1.0 - weight))) * Pose::from_translation(-center);
+    let apart = first.0.transform_point(center) - second.0.transform_point(center);
+    let covariance =
+        first.1 * weight + second.1 * (1.0 - weight) + apart * apart.transpose() * (weight * (1.0 - weight));
+    (displacement, covariance)
 }
 
 /// Joint positions by time, the first at the filter's own.
@@ -73,11 +101,40 @@ impl Filter {
                     label: joint.child,
                     horizon,
                     displacement: displacements[body],
+                    center: self.mechanism.centers[body],
                     covariance_m2,
                 });
             }
         }
         forecasts
+    }
+
+    /// Where each part is expected at a later time under the wrenches read.
+    pub fn expect(&self, time_s: f64, samples: &[WrenchSample]) -> BTreeMap<Label, Pose> {
+        let first = samples.partition_point(|s| s.stamp_s < self.time_s - 0.05);
+        let path =
+            if self.rests() { None } else { self.simulate(&[], &[self.time_s, time_s], &samples[first..], STEP) };
+        let positions = path.and_then(|mut path| path.pop()).unwrap_or_else(|| self.state.positions.clone());
+        self.placed(&self.before_unknown_stops(&positions).0)
+    }
+
+    /// Each part after each horizon if its joints keep their rates, fading, and if they stop.
+    pub fn steady(&self, horizons_s: &[f64]) -> BTreeMap<Label, Vec<[Pose; 2]>> {
+        let stopped = self.placed(&self.state.positions);
+        let mut steady: BTreeMap<Label, Vec<[Pose; 2]>> = BTreeMap::new();
+        for horizon_s in horizons_s {
+            let lasting = FADE * (1.0 - (-horizon_s / FADE).exp());
+            let moved = self.state.positions.iter().zip(&self.state.rates).map(|(q, rate)| q + rate * lasting);
+            for (label, pose) in self.placed(&moved.collect::<Vec<_>>()) {
+                steady.entry(label).or_default().push([pose, stopped[&label]]);
+            }
+        }
+        steady
+    }
+
+    fn placed(&self, positions: &[f64]) -> BTreeMap<Label, Pose> {
+        let displacements = self.mechanism.tree.displacements(positions);
+        self.mechanism.joints.iter().map(|joint| joint.child).zip(displacements).collect()
     }
 
     /// The joints' path from the present state, some coordinates changed; `None` if it is not finite.
@@ -94,7 +151,8 @@ impl Filter {
         let mut workspace = Workspace::new(&tree);
         let mut cursor = 0;
         let first = self.state.positions.clone();
-        let speeds: Vec<f64> = self.state.rates.iter().map(|rate| rate.abs()).collect();
+        let speed = |joint: usize| self.state.rates[joint].abs().min(FASTEST / self.mechanism.reach(joint));
+        let speeds: Vec<f64> = (0..first.len()).map(speed).collect();
         let mut path = vec![state.positions.clone()];
         for span in times_s.windows(2) {
             drive.run(&mut tree, &mut state, [span[0], span[1]], &disturbance, (&mut workspace, &mut cursor));

@@ -132,9 +132,13 @@ impl TrackedMechanism {
 
     /// The same with no more than the declared physics; `None` if that makes no tree.
     pub fn without_effects(&self) -> Option<Self> {
-        let mut bodies = self.tree.bodies().to_vec();
-        bodies.iter_mut().for_each(|body| body.parameters.effects.clear());
-        Some(Self { tree: Tree::new(bodies, self.tree.gravity()).ok()?, ..self.clone() })
+        let whole = self.trees.clone();
+        let trees = TreeFamily::new(move |numbers| {
+            let mut tree = (whole.0)(numbers)?;
+            (0..tree.body_count()).for_each(|body| tree.parameters_mut(body).effects.clear());
+            Some(tree)
+        });
+        Some(Self { tree: trees.tree(&self.numbers)?, trees, ..self.clone() })
     }
 
     /// The body of a part.

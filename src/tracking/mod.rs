@@ -4,19 +4,25 @@
 //! where nothing touches it ([`FreePart`]). A joint: the filter's position and rate, simulated on under
 //! the applied wrench at the carried contact point ([`Filter`], [`Filter::forecast`]).
 
+mod calibration;
 mod filter;
 mod forecast;
 mod free;
 mod mechanism;
 mod plan;
+mod presence;
 mod score;
 mod simulation;
+mod skill;
 #[cfg(test)]
 mod tests;
 
+pub use calibration::{Calibration, Kind};
 pub use filter::{Filter, Held};
-pub use forecast::Forecast;
+pub use forecast::{Forecast, mix};
 pub use free::FreePart;
 pub use mechanism::{ActiveNumber, TrackedMechanism, TreeFamily};
 pub use plan::{Plan, PlannedPose};
+pub use presence::{Account, Presence};
 pub use score::{MeasuredPath, ResidualSum};
+pub use skill::Skill;
