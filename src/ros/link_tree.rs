@@ -13,8 +13,10 @@ use crate::structure::TreeDistribution;
 use crate::types::Label;
 use crate::types::posterior::{EdgePosterior, JointTypeProbabilities, ObjectPosterior};
 
-/// A part whose joint has no type likelier than this is taken to be fixed to the root.
+/// A part whose joint has no type likelier than this is fixed to a parent that is at least as likely as
+/// the second, else to the root.
 const UNDECIDED: f64 = 0.5;
+const DECIDED_PARENT: f64 = 0.9;
 /// An axis shorter than this has no direction.
 const SHORT: f64 = 1e-6;
 
@@ -95,8 +97,8 @@ pub struct Link {
     pub parent: Option<usize>,
     /// How it moves on its parent.
     pub joint: LinkJoint,
-    /// Index of the posterior's edge that this is; `None` for the root and for what is fixed to it for
-    /// want of evidence.
+    /// Index of the posterior's edge that this is; `None` for the root and for what is fixed for want of
+    /// evidence.
     pub edge: Option<usize>,
     /// Where the link's frame was at the first frame \[m\].
     pub origin: Vector3<f64>,
@@ -119,8 +121,8 @@ pub fn joint_name(child: Label) -> String {
 }
 
 impl LinkTree {
-    /// The tree of the likeliest edges. What has no joint type likelier than even is fixed to the root:
-    /// it was only ever seen at rest.
+    /// The tree of the likeliest edges. What has no joint type likelier than even is fixed: to its parent
+    /// if that is known, as it went with it; else to the root, as it was only ever seen at rest.
     pub fn likeliest(posterior: &ObjectPosterior) -> Self {
         let ends = posterior.edges.iter().flat_map(|edge| [edge.parent, edge.child]);
         let mut others: Vec<Label> = ends.chain(posterior.parts.iter().map(|part| part.label)).collect();
@@ -231,13 +233,15 @@ fn likeliest_parents(edges: &DMatrix<Option<usize>>, posterior: &ObjectPosterior
     let count = edges.nrows();
     let mut log_weights = DMatrix::from_element(count, count, f64::NEG_INFINITY);
     for child in 1..count {
-        if is_undecided(edges, child, posterior) {
+        let probability = |edge: usize| posterior.edges[edge].probability;
+        let likeliest = edges.column(child).iter().flatten().map(|edge| probability(*edge)).fold(0.0, f64::max);
+        if is_undecided(edges, child, posterior) && likeliest < DECIDED_PARENT {
             log_weights[(0, child)] = 0.0;
             continue;
         }
         for parent in 0..count {
             if let Some(edge) = edges[(parent, child)] {
-                log_weights[(parent, child)] = posterior.edges[edge].probability.ln();
+                log_weights[(parent, child)] = probability(edge).ln();
             }
         }
     }
@@ -266,6 +270,19 @@ mod tests {
         assert_eq!((handle.0, handle.1), (7, Some(2)));
         assert!(matches!(handle.2, LinkJoint::Revolute { .. }));
         assert_eq!(tree.links()[1].edge, None);
+    }
+
+    #[test]
+    fn what_went_with_its_parent_is_fixed_to_it() {
+        let mut posterior = door_with_drawer_and_handle();
+        posterior.edges.retain(|edge| (edge.parent, edge.child) != (Label(4), Label(7)));
+        let handle = posterior.edges.iter_mut().find(|edge| edge.child == Label(7)).unwrap();
+        handle.probability = 1.0;
+        handle.joint_type = JointTypeProbabilities::UNIFORM;
+        let tree = LinkTree::likeliest(&posterior);
+        let handle = tree.links().iter().find(|link| link.label == Label(7)).unwrap();
+        assert_eq!((handle.joint, handle.edge), (LinkJoint::Fixed, None));
+        assert_eq!(handle.parent.map(|parent| tree.links()[parent].label), Some(Label(2)));
     }
 
     #[test]
