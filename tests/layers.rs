@@ -149,6 +149,15 @@ fn only_geometry_knows_parry() {
 }
 
 #[test]
+fn only_node_knows_dds() {
+    for source in sources().iter().filter(|source| source.layer != "node") {
+        for outside in ["rustdds", "ros2_client", "tokio"] {
+            assert!(used_after(&source.code, outside).is_empty(), "src/{}: {outside}", source.path.display());
+        }
+    }
+}
+
+#[test]
 fn only_the_outer_layers_touch_files_clocks_and_the_network() {
     let mut wrong = Vec::new();
     for source in sources().iter().filter(|source| !OUTER.contains(&source.layer.as_str())) {

@@ -97,17 +97,22 @@ impl Announcer {
                 self.believe(posterior, pipeline.hulls(), BTreeMap::new(), counters, stamp);
             }
         }
-        let Some(model) = self.model.clone() else { return };
+        self.say_state(stamp);
+        let at = now();
+        if self.drawn.is_none_or(|drawn| at.duration_since(drawn) > DRAW_EVERY) {
+            self.draw(stamp);
+        }
+    }
+
+    /// Where the joints and links are.
+    fn say_state(&mut self, stamp: Stamp) {
+        let Some(model) = &self.model else { return };
         self.positions = model.tree.positions(&self.displacements, &self.positions);
         let states = joint_states(&model.tree, &self.positions, &BTreeMap::new(), &self.frame, stamp);
         self.outputs.send(Publication::JointStates(states));
         if self.tf {
             let transforms = link_transforms(&model.tree, &self.displacements, &self.frame, stamp);
             self.outputs.send(Publication::Tf(transforms));
-        }
-        let at = now();
-        if self.drawn.is_none_or(|drawn| at.duration_since(drawn) > DRAW_EVERY) {
-            self.draw(stamp);
         }
     }
 
@@ -156,6 +161,8 @@ impl Announcer {
         let tree = LinkTree::likeliest(&posterior);
         self.model = Some(Arc::new(Model { posterior, tree, hulls, ranges_seen }));
         self.draw(stamp);
+        // The description has joints that no state was said of yet.
+        self.say_state(stamp);
     }
 
     fn draw(&mut self, stamp: Stamp) {

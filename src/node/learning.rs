@@ -12,7 +12,7 @@ use crate::pipeline::{ClosedWindow, Learned, Worker};
 /// Windows that wait at most; one more, and the oldest that waits is dropped and counted.
 const MOST_WAITING: usize = 4;
 /// How much tracking goes before other programs and inference after them, in nice's steps.
-const NICENESS: (i32, i32) = (-10, 10);
+const NICENESS: (i32, i32) = (-10, 3);
 
 /// A window, and which life of the pipeline it is from.
 struct Job {

@@ -118,7 +118,7 @@ impl Managed {
             tokio::task::spawn_blocking(move || planning::answer(&ground, &request)).await?
         };
         let answered: anyhow::Result<PredictResponse> = answered.await;
-        answered.unwrap_or_else(|error| PredictResponse { message: format!("{error:#}"), ..PredictResponse::default() })
+        answered.unwrap_or_else(|error| PredictResponse { message: reason(&error), ..PredictResponse::default() })
     }
 
     /// Writes what was learned, while the stream goes on.
@@ -201,6 +201,17 @@ fn since_epoch() -> std::time::Duration {
     SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default()
 }
 
+/// Why something failed, in one line; many an error says its cause itself.
+fn reason(error: &anyhow::Error) -> String {
+    let mut text = error.to_string();
+    for cause in error.chain().skip(1).map(ToString::to_string) {
+        if !text.contains(&cause) {
+            text = format!("{text}: {cause}");
+        }
+    }
+    text
+}
+
 /// Answers every request, in order.
 fn answer<Q, A, F>(server: Server<Wire<Q>, Wire<A>>, respond: impl Fn(Q) -> F + Send + 'static)
 where
@@ -256,7 +267,7 @@ pub fn serve(participant: &mut Participant, managed: &Managed) -> anyhow::Result
         async move {
             match own.save(PathBuf::from(&request.path)).await {
                 Ok(()) => SaveModelResponse { success: true, message: format!("saved to {}", request.path) },
-                Err(error) => SaveModelResponse { success: false, message: format!("{error:#}") },
+                Err(error) => SaveModelResponse { success: false, message: reason(&error) },
             }
         }
     });
@@ -268,7 +279,7 @@ pub fn serve(participant: &mut Participant, managed: &Managed) -> anyhow::Result
         async move {
             match own.load(PathBuf::from(&request.path)).await {
                 Ok(()) => LoadModelResponse { success: true, message: format!("goes on from {}", request.path) },
-                Err(error) => LoadModelResponse { success: false, message: format!("{error:#}") },
+                Err(error) => LoadModelResponse { success: false, message: reason(&error) },
             }
         }
     });

@@ -245,7 +245,8 @@ def live(bag, settle="60", model="/tmp/model.json"):
     late.wait(lambda: late.last("object_posterior") and late.last("robot_description"), 10.0)
     posterior = node.last("object_posterior")
     predicted = node.last("predicted_poses")
-    markers = {m.ns for _, message in node.heard[f"{NODE}/markers"] for m in message.markers}
+    # What removes all before has no namespace, and whoever joins later does not hear it.
+    markers = {m.ns for _, message in node.heard[f"{NODE}/markers"] for m in message.markers if m.ns}
     largest = max(len(serialize_message(m)) for _, m in node.heard[f"{NODE}/markers"]) if markers else 0
     description = node.last("robot_description")
     states = node.last("joint_states")
