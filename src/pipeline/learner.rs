@@ -416,12 +416,24 @@ impl Learner {
             let starts = self.start_axes(&part, parent, joint_type, &relative, motions);
             let fit = moving_evidence(&part, joint_type, &starts, &relative, &resting, &self.settings);
             let slot = joint_type as usize;
-            if let Some(fit) = fit {
+            if let Some(mut fit) = fit {
+                self.keep_sign(&mut fit, child, parent);
                 option.log_evidence[slot] = option.log_evidence[slot].max(past[slot] + fit.log_evidence);
                 option.fits[slot] = Some(fit);
             }
         }
         option
+    }
+
+    /// Turns a fit the way the one before counted: an axis's sign is free, but what was learned goes by it.
+    fn keep_sign(&self, fit: &mut EdgeFit, child: Label, parent: Option<Label>) {
+        let options = self.evidence.get(&child).map_or(&[][..], Vec::as_slice);
+        let before = options.iter().find(|option| option.parent == parent);
+        let before = before.and_then(|option| option.fits[fit.joint.joint_type as usize].as_ref());
+        if before.is_some_and(|before| before.joint.axis.direction.dot(&fit.joint.axis.direction) < 0.0) {
+            fit.joint.axis.direction = -fit.joint.axis.direction;
+            fit.positions.iter_mut().flatten().for_each(|position| *position = -*position);
+        }
     }
 
     /// The windows in which a part keeps its place on a parent, by their tracks.

@@ -62,16 +62,12 @@ impl Learner {
             for (past, added) in option.past.iter_mut().zip(added) {
                 *past += added;
             }
-            if window < option.rigid_by_window.len() {
-                option.rigid_by_window.remove(window);
-            }
+            drop_at(&mut option.rigid_by_window, window);
             for fit in option.fits.iter_mut().flatten() {
                 // The type's evidence is `past` and this: what moves over to the one leaves the other.
                 let own = if window < fit.by_window.len() { fit.by_window.remove(window) } else { 0.0 };
                 fit.log_evidence -= own;
-                if window < fit.positions.len() {
-                    fit.positions.remove(window);
-                }
+                drop_at(&mut fit.positions, window);
             }
         }
         for (label, tracks) in &mut self.tracks {
@@ -88,13 +84,12 @@ impl Learner {
             }
         }
         if let Some(fit) = &mut self.fit {
-            fit.positions.remove(window);
-            fit.contact_points.remove(window);
-            fit.window_costs.remove(window);
-            fit.window_information.remove(window);
-            for moves in &mut fit.moves {
-                moves.remove(window);
-            }
+            // A fit that failed leaves the one before, which may not know the newest window.
+            drop_at(&mut fit.positions, window);
+            drop_at(&mut fit.contact_points, window);
+            drop_at(&mut fit.window_costs, window);
+            drop_at(&mut fit.window_information, window);
+            fit.moves.iter_mut().for_each(|moves| drop_at(moves, window));
         }
         self.windows.remove(window);
     }
@@ -106,5 +101,12 @@ impl Learner {
         let of =
             |parent: Option<Label>| options.iter().find(|option| option.parent == parent).map(|option| option.past);
         of(parent).or_else(|| of(None)).unwrap_or_default()
+    }
+}
+
+/// Takes an entry out, if there is one.
+fn drop_at<T>(list: &mut Vec<T>, index: usize) {
+    if index < list.len() {
+        list.remove(index);
     }
 }

@@ -216,7 +216,7 @@ impl Learner {
         positions
     }
 
-    /// Parts of a frame that are not where they should be.
+    /// Parts of a frame that are not where they should be; the root, if it is not in the frame at all.
     fn unexplained(&self, frame: &Frame) -> Vec<Label> {
         let off = |(label, scan): (&Label, &Vec<ScanPoint>)| {
             let model = self.models.get(label).filter(|_| scan.len() >= FEWEST_POINTS)?;
@@ -227,7 +227,8 @@ impl Learner {
             let cost = truncated_cost(model, scan, scan.len() / 150, &displacement);
             (cost - usual > UNEXPLAINED.min(0.5 * (OUTLIER_COST - usual))).then_some(*label)
         };
-        frame.scans.iter().filter_map(off).collect()
+        let unseen = Some(self.root).filter(|root| !frame.scans.contains_key(root));
+        frame.scans.iter().filter_map(off).chain(unseen).collect()
     }
 
     /// Adds parts that are not known yet, as they stand in these frames.
