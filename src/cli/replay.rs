@@ -9,7 +9,7 @@ use anyhow::{Context, bail};
 use bayesian_object_models::{
     io::{
         bag::Bag,
-        config::{Config, InputConfig},
+        config::{Config, Engine, InputConfig},
         counters::Counters,
         document::PosteriorDocument,
         ingest::Ingest,
