@@ -88,7 +88,7 @@ impl Ingest {
         }
         match role {
             Role::Tf | Role::TfStatic => self.take_transforms(topic, role, message),
-            Role::Cloud | Role::Wrench(_) | Role::Pose(_) => {
+            Role::Cloud | Role::Wrench(_) | Role::PartWrench(_) | Role::Pose(_) => {
                 self.count_arrival(role);
                 match self.read(topic, role, message) {
                     Ok(waiting) => self.enqueue(topic, role, waiting),
@@ -139,6 +139,12 @@ impl Ingest {
                 let message: WrenchStamped = decode(message)?;
                 let stamp = checked_stamp(&message.header)?;
                 let content = Content::wrench(&message.wrench, source, &self.config, stamp)?;
+                Ok(WaitingMessage { stamp, frame: message.header.frame_id, content })
+            }
+            Role::PartWrench(label) => {
+                let message: WrenchStamped = decode(message)?;
+                let stamp = checked_stamp(&message.header)?;
+                let content = Content::part_wrench(&message.wrench, label, &self.config, stamp)?;
                 Ok(WaitingMessage { stamp, frame: message.header.frame_id, content })
             }
             Role::Pose(label) => {
@@ -236,7 +242,7 @@ impl Ingest {
     fn count_arrival(&mut self, role: Role) {
         match role {
             Role::Cloud => self.counters.clouds_in += 1,
-            Role::Wrench(_) => self.counters.wrenches_in += 1,
+            Role::Wrench(_) | Role::PartWrench(_) => self.counters.wrenches_in += 1,
             Role::Pose(_) => self.counters.poses_in += 1,
             Role::Tf | Role::TfStatic => self.counters.tf_in += 1,
         }
@@ -245,7 +251,7 @@ impl Ingest {
     fn reject(&mut self, topic: &str, role: Role, rejection: Rejection) {
         let reasons = match role {
             Role::Cloud => &mut self.counters.clouds_dropped,
-            Role::Wrench(_) => &mut self.counters.wrenches_dropped,
+            Role::Wrench(_) | Role::PartWrench(_) => &mut self.counters.wrenches_dropped,
             Role::Pose(_) => &mut self.counters.poses_dropped,
             Role::Tf | Role::TfStatic => &mut self.counters.tf_dropped,
         };

@@ -10,6 +10,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use nalgebra::{Matrix6, Vector3, Vector6};
 use rayon::prelude::*;
 
+use super::poses::SeenPose;
 use crate::math::{Pose, Screw};
 use crate::mechanism::JointType;
 use crate::model::{
@@ -41,6 +42,10 @@ pub struct Frame {
     pub time_s: f64,
     /// Each part's points.
     pub scans: BTreeMap<Label, Vec<ScanPoint>>,
+    /// The parts whose pose a topic measures; they have no scans.
+    pub poses: BTreeMap<Label, SeenPose>,
+    /// Whether one of these moves.
+    pub moves: bool,
 }
 
 /// What a part's scans cost where its pose is known.
@@ -87,11 +92,12 @@ pub struct Motion {
     pub seed: Option<(Option<Label>, AxisSeed)>,
 }
 
-/// The motions of all parts with a model, but the root.
-pub fn explain_window(scene: &Scene<'_>) -> BTreeMap<Label, Motion> {
-    let mut motions: BTreeMap<Label, Motion> = BTreeMap::new();
+/// The motions of all parts with a model, but the root; `measured` are those that need no explanation.
+pub fn explain_window(scene: &Scene<'_>, measured: BTreeMap<Label, Motion>) -> BTreeMap<Label, Motion> {
+    let mut motions = measured;
     let mut open: Vec<Label> = Vec::new();
-    for &label in scene.models.keys().filter(|&&label| label != scene.root) {
+    let unknown: Vec<Label> = scene.models.keys().copied().filter(|l| !motions.contains_key(l)).collect();
+    for label in unknown.into_iter().filter(|&label| label != scene.root) {
         let still = scene.evaluate(label, |_| scene.start_of(label));
         if still.excess < EXPLAINED && scene.tool_miss(label, &still.displacements) < TOOL_EXPLAINED {
             motions.insert(label, still);

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use nalgebra::{DMatrix, Vector3};
 use rayon::prelude::*;
 
+use super::poses::{POSED_RADIUS, PosedPart, measured_motion};
 use super::explain::{Baseline, Frame, Motion, Scene, explain_window, measure_faces, travel};
 use crate::geometry::{HullProperties, hull_properties};
 use crate::math::Pose;
@@ -97,6 +98,8 @@ pub struct Learner {
     pub inferences: Vec<WindowInference>,
     /// Hulls of the parts, as first seen.
     pub hulls: BTreeMap<Label, HullProperties>,
+    /// Parts whose pose a topic measures, as first seen; they have models without surfels.
+    pub posed: BTreeMap<Label, PosedPart>,
 }
 
 impl Learner {
@@ -124,7 +127,46 @@ impl Learner {
             dynamics: DynamicsLearner::new(Vector3::new(0.0, 0.0, -9.81)),
             inferences: Vec::new(),
             hulls: BTreeMap::new(),
+            posed: BTreeMap::new(),
         }
+    }
+
+    /// Adds a part whose pose a topic measures, where it was at the reference configuration.
+    pub fn add_posed(&mut self, label: Label, part: PosedPart) {
+        let origin = part.world_from_frame.translation;
+        self.models.insert(label, PartModel::of_frame(origin, POSED_RADIUS));
+        self.hulls.insert(label, HullProperties::guess(origin, POSED_RADIUS));
+        self.posed.insert(label, part);
+    }
+
+    /// Takes in what pose topics measured in a window: the motions, with the observations noted.
+    fn measured_motions(&mut self, job: &WindowJob, window: &mut WindowObservations) -> BTreeMap<Label, Motion> {
+        for frame in &job.frames {
+            for (label, seen) in &frame.poses {
+                // A part that was not there at the first look is taken to have been at rest until now.
+                if !self.posed.contains_key(label) {
+                    self.add_posed(
+                        *label,
+                        PosedPart { world_from_frame: seen.world_from_frame, information: seen.information },
+                    );
+                }
+            }
+        }
+        let mut motions = BTreeMap::new();
+        for (label, part) in self.posed.iter().filter(|(label, _)| **label != self.root) {
+            let measured: Vec<_> =
+                job.frames.iter().map(|f| f.poses.get(label).map(|seen| part.measurement(seen))).collect();
+            let start = self.displacements.get(label).copied().unwrap_or_else(Pose::identity);
+            motions.insert(*label, measured_motion(&start, &part.world_from_frame.translation, &measured));
+            window.poses.insert(*label, measured);
+            window.direct.insert(*label, part.information);
+            // Windows before it was seen.
+            let tracks = self.tracks.entry(*label).or_default();
+            for earlier in &self.windows[tracks.len()..] {
+                tracks.push(vec![start; earlier.times_s.len()]);
+            }
+        }
+        motions
     }
 
     /// The likeliest joints so far, parents first.
@@ -154,6 +196,13 @@ impl Learner {
 
     /// Learns one window.
     pub fn learn(&mut self, job: &WindowJob) {
+        let mut observations = WindowObservations {
+            times_s: job.frames.iter().map(|f| f.time_s).collect(),
+            contacts: if self.use_tool { job.contacts.clone() } else { Vec::new() },
+            wrenches: job.wrenches.clone(),
+            ..WindowObservations::default()
+        };
+        let measured = self.measured_motions(job, &mut observations);
         let scene = Scene {
             frames: &job.frames,
             contacts: &job.contacts,
@@ -165,16 +214,10 @@ impl Learner {
             root: self.root,
             use_tool: self.use_tool,
         };
-        let motions = explain_window(&scene);
+        let motions = explain_window(&scene, measured);
         for (label, motion) in &motions {
             tracing::debug!(%label, moved = motion.moved, excess = motion.excess, seed = ?motion.seed, "motion");
         }
-        let observations = WindowObservations {
-            times_s: job.frames.iter().map(|f| f.time_s).collect(),
-            contacts: if self.use_tool { job.contacts.clone() } else { Vec::new() },
-            wrenches: job.wrenches.clone(),
-            ..WindowObservations::default()
-        };
         let moved = |label: &Label| motions.get(label).is_some_and(|m| m.moved);
         self.touched.extend(job.contacts.iter().map(|c| c.label).filter(moved));
         for (label, motion) in &motions {
@@ -222,6 +265,9 @@ impl Learner {
 
     /// Measures a part's poses in the last window, about its track.
     fn measure(&mut self, label: Label, frames: &[Frame]) {
+        if self.posed.contains_key(&label) {
+            return;
+        }
         let settings = AlignmentSettings { gate: 0.02, ..AlignmentSettings::default() };
         let Some(track) = self.tracks.get(&label).and_then(|t| t.last()) else { return };
         let faces: Vec<_> = frames
@@ -276,8 +322,9 @@ impl Learner {
     fn weigh_edge(&self, child: Label, parent: Option<Label>, motions: &BTreeMap<Label, Motion>) -> ParentEvidence {
         let windows: Vec<&WindowObservations> = self.windows.iter().collect();
         let part = self.part(child);
-        let track = parent.map(|p| self.tracks[&p].as_slice());
-        let relative = relative_windows(child, track, &windows);
+        let carrier = parent.map(|p| self.part(p));
+        let carrier = carrier.as_ref().map(|part| (part, self.tracks[&part.label].as_slice()));
+        let relative = relative_windows(&part, carrier, &windows);
         let resting = self.resting_windows(child, parent);
         let rigid = rigid_evidence(&part, &relative, &self.settings);
         let mut option = ParentEvidence { parent, log_evidence: [rigid; 3], fits: [None, None, None] };
@@ -392,6 +439,9 @@ impl Learner {
     /// Log prior of a joint between two parts by the gap between their surfaces: what is joined
     /// touches. `None`: the nearest of the parts that never moved.
     fn log_contact_prior(&self, child: Label, parent: Option<Label>) -> f64 {
+        if self.posed.contains_key(&child) || parent.is_some_and(|parent| self.posed.contains_key(&parent)) {
+            return 0.0;
+        }
         let gap = |other: Label| self.gaps.get(&(child.min(other), child.max(other))).copied().unwrap_or(0.0);
         let gap = match parent {
             Some(parent) => gap(parent),

@@ -3,6 +3,7 @@
 mod explain;
 mod forecast;
 mod learner;
+mod poses;
 mod posterior;
 mod windows;
 mod working_frame;
@@ -12,6 +13,7 @@ use std::collections::BTreeMap;
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
 pub use explain::Frame;
+pub use poses::PoseSettings;
 pub use learner::{Learner, ParentEvidence, WindowJob};
 pub use windows::{FrameAssembler, WindowCutter, WindowSettings};
 
@@ -21,6 +23,7 @@ use crate::registration::{AlignmentSettings, Quadratic, SurfelAccumulator, align
 use crate::types::{Input, Label, Stamp};
 use explain::{FEWEST_POINTS, measurement_of, travel};
 use forecast::Forecaster;
+use poses::{POSED_RADIUS, PoseBuffer, PosedPart, references};
 use windows::frame_of;
 use working_frame::WorkingFrame;
 
@@ -38,6 +41,8 @@ pub struct PipelineSettings {
     pub use_tool: bool,
     /// When windows open and close.
     pub windows: WindowSettings,
+    /// How poses that a topic measures become observations.
+    pub poses: PoseSettings,
     /// What is assumed of the pose measurements.
     pub kinematics: KinematicSettings,
     /// Gravity in world \[m/s²\].
@@ -87,6 +92,7 @@ pub struct Pipeline {
     working_frame: WorkingFrame,
     zero: Option<Stamp>,
     assembler: FrameAssembler,
+    poses: PoseBuffer,
     early: Vec<Input>,
     cutter: Option<WindowCutter>,
     accumulators: BTreeMap<Label, SurfelAccumulator>,
@@ -105,6 +111,7 @@ impl Pipeline {
             settings.predict.then(|| Forecaster::new(settings.root, settings.use_tool, settings.posterior_latency_s));
         Self {
             forecaster,
+            poses: PoseBuffer::new(settings.poses),
             settings,
             working_frame: WorkingFrame::Open(Vec::new()),
             zero: None,
@@ -132,6 +139,10 @@ impl Pipeline {
                 let ready = self.assembler.push(cloud);
                 ready.into_iter().flat_map(|(stamp, clouds)| self.push_frame(stamp, &clouds)).collect()
             }
+            Input::Pose(pose) => {
+                let ready = self.poses.push(*pose);
+                ready.into_iter().flat_map(|stamp| self.push_frame(stamp, &[])).collect()
+            }
             other => {
                 let predictions = match (&mut self.forecaster, &other) {
                     (Some(forecaster), Input::Wrench(wrench)) => forecaster.push_wrench(wrench),
@@ -152,6 +163,9 @@ impl Pipeline {
         for (stamp, clouds) in self.assembler.flush() {
             outputs.extend(self.push_frame(stamp, &clouds));
         }
+        for stamp in self.poses.flush() {
+            outputs.extend(self.push_frame(stamp, &[]));
+        }
         let job = self.cutter.as_mut().and_then(|c| c.flush(nearest_label));
         outputs.extend(job.map(|job| self.learn(&job)));
         outputs.extend(self.forecaster.iter_mut().flat_map(Forecaster::finish));
@@ -159,15 +173,21 @@ impl Pipeline {
     }
 
     fn push_frame(&mut self, stamp: Stamp, clouds: &[crate::types::SegmentedCloud]) -> Vec<Output> {
-        let zero =
-            *self.zero.get_or_insert_with(|| self.early.iter().map(Input::stamp).chain([stamp]).min().unwrap_or(stamp));
+        let earlier = self.early.iter().map(Input::stamp).chain(self.poses.first());
+        let zero = *self.zero.get_or_insert_with(|| earlier.chain([stamp]).min().unwrap_or(stamp));
+        if !clouds.is_empty() {
+            self.poses.saw_clouds(stamp);
+        }
         let cutter = self.cutter.get_or_insert_with(|| WindowCutter::new(self.settings.windows, zero));
         for input in self.early.drain(..) {
             if let Input::Wrench(wrench) = input {
                 cutter.push_wrench(wrench);
             }
         }
-        let frame = frame_of(stamp.seconds_since(zero), clouds);
+        let mut frame = frame_of(stamp.seconds_since(zero), clouds);
+        frame.scans.retain(|label, _| !self.poses.measures(*label));
+        frame.poses = self.poses.at(stamp);
+        frame.moves = self.poses.something_moves(frame.time_s, &frame.poses);
         let mut outputs = self.observe(&frame);
         let moving = self.moving;
         let seen = self.forecaster.is_some().then(|| frame.clone());
@@ -192,7 +212,7 @@ impl Pipeline {
             if let Some(learner) = self.learner.as_ref().filter(|_| closed) {
                 forecaster.learned(learner);
             }
-            let rest_force = self.cutter.as_ref().and_then(|cutter| cutter.rest_force).unwrap_or_default();
+            let rest_force = self.cutter.as_ref().and_then(WindowCutter::rest_force).unwrap_or_default();
             outputs.extend(forecaster.push_frame(frame, self.learner.as_ref(), zero, rest_force));
         }
         outputs
@@ -210,13 +230,16 @@ impl Pipeline {
             }
         }
         let accumulators = std::mem::take(&mut self.accumulators);
-        let root = self.settings.root.unwrap_or_else(|| {
-            accumulators.iter().max_by_key(|(_, a)| a.voxel_means(1.0).len()).map_or(Label(0), |(l, _)| *l)
-        });
+        let posed = references(&self.reference);
+        let largest = accumulators.iter().max_by_key(|(_, a)| a.voxel_means(1.0).len()).map(|(label, _)| *label);
+        let root = self.settings.root.or(largest).unwrap_or_else(|| unused_label(&posed));
         let mut learner = Learner::new(root, self.settings.use_tool, accumulators);
         learner.settings = self.settings.kinematics;
         learner.dynamics = DynamicsLearner::new(self.gravity_in_work());
         learner.calibrate(&self.reference);
+        for (label, part) in posed {
+            learner.add_posed(label, part);
+        }
         self.reference.clear();
         self.learner = Some(learner);
     }
@@ -233,19 +256,16 @@ impl Pipeline {
 
     /// Registers every part of a frame, from where it was.
     fn observe(&mut self, frame: &Frame) -> Vec<Output> {
+        let mut outputs = self.observe_poses(frame);
         let Some(learner) = &self.learner else {
-            return frame
-                .scans
-                .keys()
-                .map(|label| Output::Observation {
-                    time_s: frame.time_s,
-                    label: *label,
-                    measurement: PoseMeasurement { displacement: Pose::identity(), information: Matrix6::zeros() },
-                })
-                .collect();
+            outputs.extend(frame.scans.keys().map(|label| Output::Observation {
+                time_s: frame.time_s,
+                label: *label,
+                measurement: PoseMeasurement { displacement: Pose::identity(), information: Matrix6::zeros() },
+            }));
+            return outputs;
         };
         let settings = AlignmentSettings::default();
-        let mut outputs = Vec::new();
         for (label, scan) in &frame.scans {
             let last = self.current.get(label).copied().unwrap_or_else(Pose::identity);
             let mut measurement = PoseMeasurement { displacement: last, information: Matrix6::zeros() };
@@ -268,6 +288,21 @@ impl Pipeline {
             self.recent.remove(0);
         }
         outputs
+    }
+
+    /// What pose topics measured in a frame; until the first window opens, since the first frame.
+    fn observe_poses(&self, frame: &Frame) -> Vec<Output> {
+        let learned = |label| self.learner.as_ref().and_then(|learner| learner.posed.get(label)).copied();
+        let first = self.reference.first().unwrap_or(frame);
+        let outputs = frame.poses.iter().map(|(label, seen)| {
+            let seen_first = || first.poses.get(label).unwrap_or(seen);
+            let part = learned(label).unwrap_or_else(|| {
+                let seen = seen_first();
+                PosedPart { world_from_frame: seen.world_from_frame, information: seen.information }
+            });
+            Output::Observation { time_s: frame.time_s, label: *label, measurement: part.measurement(seen) }
+        });
+        outputs.collect()
     }
 
     /// Whether a part is seen away from where it was a few frames ago: the older pose must explain
@@ -297,6 +332,14 @@ fn nearest_label(place: &Vector3<f64>, frame: &Frame) -> Option<Label> {
             distances.select_nth_unstable_by(rank, f64::total_cmp);
             Some((distances[rank], *label))
         })
+        .chain(frame.poses.iter().map(|(label, seen)| {
+            (((seen.world_from_frame.translation - place).norm() - POSED_RADIUS).max(0.0), *label)
+        }))
         .min_by(|a, b| a.0.total_cmp(&b.0))
         .map(|(_, label)| label)
+}
+
+/// A name for the world, where it is none of the parts.
+fn unused_label(parts: &BTreeMap<Label, PosedPart>) -> Label {
+    (0..).map(Label).find(|label| !parts.contains_key(label)).unwrap_or_default()
 }

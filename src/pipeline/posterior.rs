@@ -5,7 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use nalgebra::{DMatrix, Matrix3, Vector3};
 
 use super::{Learner, ParentEvidence, Pipeline};
-use crate::geometry::hull_properties;
+use super::poses::POSED_RADIUS;
+use crate::geometry::{HullProperties, hull_properties};
 use crate::mechanism::JointType;
 use crate::model::{Axis, DynamicsPosterior, JointDynamics, KinematicFit, WindowInference, WindowObservations};
 use crate::structure::TreeDistribution;
@@ -25,13 +26,20 @@ impl Pipeline {
     /// What is believed now, in the working frame.
     pub(super) fn posterior_in_work(&self) -> Option<ObjectPosterior> {
         let points = self.points();
+        let posed = self.posed_origins();
+        if points.is_empty() && posed.is_empty() {
+            return None;
+        }
+        let largest = || points.iter().max_by_key(|(_, points)| points.len()).map(|(label, _)| *label);
         let root = match (&self.learner, self.settings.root) {
-            (Some(learner), _) => learner.root,
+            (Some(learner), _) => learner.root_or_still(self.settings.root),
             (None, Some(root)) => root,
-            (None, None) => points.iter().max_by_key(|(_, points)| points.len()).map(|(label, _)| *label)?,
+            (None, None) => largest().or_else(|| posed.keys().next().copied())?,
         };
-        let labels: Vec<Label> = points.keys().copied().collect();
+        let labels: Vec<Label> = points.keys().chain(posed.keys()).copied().collect();
         let mut parts: Vec<PartPosterior> = points.iter().filter_map(|(label, points)| part(*label, points)).collect();
+        parts.extend(posed.iter().map(|(label, origin)| posed_part(*label, origin)));
+        parts.sort_by_key(|part| part.label);
         let dynamics = self.learner.as_ref().and_then(|learner| learner.dynamics.posterior().ok());
         for learned in dynamics.iter().flat_map(|dynamics| &dynamics.parts) {
             if let Some(part) = parts.iter_mut().find(|part| part.label == learned.label) {
@@ -56,6 +64,7 @@ impl Pipeline {
             return learner
                 .models
                 .iter()
+                .filter(|(label, _)| !learner.posed.contains_key(label))
                 .map(|(label, model)| (*label, model.surfels.iter().map(|s| s.point).collect()))
                 .collect();
         }
@@ -65,6 +74,38 @@ impl Pipeline {
             points.entry(*label).or_default().extend(scan.iter().map(|p| p.point_in_world));
         }
         points
+    }
+
+    /// Where the frames of parts that a topic measures were at first \[m\].
+    fn posed_origins(&self) -> BTreeMap<Label, Vector3<f64>> {
+        if let Some(learner) = &self.learner {
+            return learner.posed.iter().map(|(label, part)| (*label, part.world_from_frame.translation)).collect();
+        }
+        let first = self.reference.iter().rev().flat_map(|frame| &frame.poses);
+        first.map(|(label, seen)| (*label, seen.world_from_frame.translation)).collect()
+    }
+}
+
+impl Learner {
+    /// The root: as given, or the part taken for it; if that is none of the parts, one that never moved
+    /// while others did.
+    fn root_or_still(&self, given: Option<Label>) -> Label {
+        if given.is_some() || self.models.contains_key(&self.root) || self.evidence.is_empty() {
+            return self.root;
+        }
+        self.models.keys().copied().find(|label| !self.evidence.contains_key(label)).unwrap_or(self.root)
+    }
+}
+
+/// A part of which only a frame is known: its mass and its centre may be anything about it.
+fn posed_part(label: Label, origin: &Vector3<f64>) -> PartPosterior {
+    let (log_sd, center_sd) = (2.5, POSED_RADIUS);
+    let volume = HullProperties::guess(*origin, POSED_RADIUS).volume;
+    PartPosterior {
+        label,
+        com_in_world_m: (*origin).into(),
+        com_covariance_m2: Matrix3::from_diagonal_element(center_sd * center_sd).into(),
+        mass_kg: Quantity::from_log_normal("kg", (HULL_DENSITY.0 * volume).ln(), log_sd, InformedBy::Prior),
     }
 }
 

@@ -15,7 +15,7 @@ use super::layout::Mechanism;
 use super::track::JointTrack;
 use crate::inference::Failure;
 use crate::math::Real;
-use crate::mechanism::{State, Tree, WrenchSample, WrenchTrack, rollout};
+use crate::mechanism::{Spatial, State, Tree, WrenchSample, WrenchTrack, rollout};
 use crate::model::Axis;
 
 /// Longest step of the simulation \[s\]: half a wrench sample; trajectories of the midpoint step
@@ -259,10 +259,10 @@ impl WindowModel<'_> {
             positions[joint] = state[i];
             rates[joint] = state[n + i];
         }
-        let samples = within(&self.track.samples, span);
-        let track = self.track.touched.map(|body| WrenchTrack::new(body, samples));
+        let tracks: Vec<WrenchTrack<'_, T>> =
+            self.track.drives.iter().map(|d| WrenchTrack::new(d.joint, within(&d.samples, span))).collect();
         let step_s = if n > 1 { CHAIN_STEP_S } else { STEP_S };
-        let run = rollout(tree, &State::new(positions, rates), track.as_slice(), &span, step_s)
+        let run = rollout(tree, &State::new(positions, rates), &tracks, &span, step_s)
             .map_err(|_| Failure::Diverged)?;
         let (positions, rates) = (run.positions(1), run.rates(1));
         Ok(self.moving.iter().map(|&j| positions[j]).chain(self.moving.iter().map(|&j| rates[j])).collect())
@@ -324,23 +324,25 @@ impl ProcessNoise {
     /// Covariance that (q, q̇) gather over a span.
     fn over(&self, span: [f64; 2], q: &[f64], model: &WindowModel<'_>) -> Result<DMatrix<f64>, Failure> {
         let n = model.moving.len();
-        let track = model.track;
         let mut density = DMatrix::from_fn(n, n, |i, j| if i == j { self.floor[i] } else { 0.0 });
-        let sample = within(&track.samples, span).first();
-        if let (Some(sample), Some(touched)) = (sample, track.touched) {
-            let screws = self.tree.screws(q);
-            let mut levers = vec![nalgebra::Vector3::zeros(); n];
-            let mut at = Some(touched);
+        let screws = self.tree.screws(q);
+        for drive in &model.track.drives {
+            let Some(sample) = within(&drive.samples, span).first() else { continue };
+            let mut levers = vec![[nalgebra::Vector3::zeros(); 2]; n];
+            let mut at = Some(drive.joint);
             while let Some(joint) = at {
                 if let Some(i) = model.moving.iter().position(|&m| m == joint) {
-                    levers[i] = screws[joint].angular.cross(&sample.point_in_world) + screws[joint].linear;
+                    let Spatial { angular, linear } = screws[joint];
+                    levers[i] = [angular.cross(&sample.point_in_world) + linear, angular];
                 }
                 at = model.mechanism.joints[joint].joint.parent;
             }
-            let variance = track.force_deviation.powi(2) * track.sample_span_s;
-            for i in 0..n {
-                for j in 0..n {
-                    density[(i, j)] += variance * levers[i].dot(&levers[j]);
+            for (kind, deviation) in [drive.force_deviation, drive.torque_deviation].into_iter().enumerate() {
+                let variance = deviation.powi(2) * drive.sample_span_s;
+                for i in 0..n {
+                    for j in 0..n {
+                        density[(i, j)] += variance * levers[i][kind].dot(&levers[j][kind]);
+                    }
                 }
             }
         }
