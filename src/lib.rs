@@ -13,7 +13,7 @@
 //! # Layers
 //! Each module may use those before it in this list, never those after it; `tests/layers.rs` is
 //! the wall: `math`, `types`, `geometry`, `registration`, `mechanism`, `structure`, `inference`,
-//! `model`, `tracking`, `pipeline`, `io`, `report`.
+//! `model`, `tracking`, `pipeline`, `io`, `report`, `ros`.
 
 pub mod geometry;
 pub mod inference;
@@ -24,6 +24,7 @@ pub mod model;
 pub mod pipeline;
 pub mod registration;
 pub mod report;
+pub mod ros;
 pub mod structure;
 pub mod tracking;
 pub mod types;

@@ -180,6 +180,8 @@ impl Replay {
                 };
                 displacement_csv::write_row(&mut *file, &row).map_err(|error| file.fail(error))?;
             }
+            // A replay learns in the stream.
+            Output::WindowClosed(_) => {}
             Output::Learned { span_s } => tracing::info!(from_s = span_s.0, to_s = span_s.1, "window learned"),
         }
         Ok(())

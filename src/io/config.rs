@@ -88,6 +88,7 @@ impl Config {
             gravity_in_world: self.gravity_m_s2.into(),
             predict: false,
             posterior_latency_s: self.posterior_latency_s,
+            live: false,
         }
     }
 

@@ -9,6 +9,7 @@
 //! eliminated, so the cost is linear in the number of windows.
 
 use std::collections::BTreeMap;
+use std::f64::consts::PI;
 use std::rc::Rc;
 
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
@@ -76,6 +77,21 @@ impl KinematicJoint {
             JointType::Rigid => Screw::rigid(),
             JointType::Prismatic => Screw::prismatic(&self.axis.direction),
             JointType::Revolute => Screw::revolute(&self.axis.direction, &self.axis.point),
+        }
+    }
+
+    /// The position \[m or rad\] at which the joint comes nearest to a displacement of the child
+    /// against its parent; of a hinge's turns, the one nearest to `near`.
+    pub fn position_of(&self, displacement: &Pose, near: f64) -> f64 {
+        let direction = &self.axis.direction;
+        match self.joint_type {
+            JointType::Rigid => 0.0,
+            JointType::Prismatic => direction.dot(&(displacement.transform_point(&self.center) - self.center)),
+            JointType::Revolute => {
+                let rotation = displacement.quaternion();
+                let angle = 2.0 * rotation.imag().dot(direction).atan2(rotation.w);
+                near + (angle - near + PI).rem_euclid(2.0 * PI) - PI
+            }
         }
     }
 

@@ -51,6 +51,14 @@ pub struct WindowJob {
     pub zero: crate::types::Stamp,
 }
 
+impl WindowJob {
+    /// Seconds since time zero of its first and last frame.
+    pub fn span_s(&self) -> (f64, f64) {
+        let time = |frame: Option<&Frame>| frame.map_or(0.0, |frame| frame.time_s);
+        (time(self.frames.first()), time(self.frames.last()))
+    }
+}
+
 /// Evidence for one parent of a part.
 #[derive(Clone, Debug)]
 pub struct ParentEvidence {
@@ -63,9 +71,12 @@ pub struct ParentEvidence {
 }
 
 /// Kinematic state of everything learned.
+#[derive(Clone)]
 pub struct Learner {
     /// The part fixed to the world.
     pub root: Label,
+    /// Whether that is no part, but a name for the world.
+    pub root_is_world: bool,
     /// Whether the tool's position is an observation.
     pub use_tool: bool,
     /// Reference models.
@@ -111,6 +122,7 @@ impl Learner {
         let models = reference.iter().filter_map(|(label, s)| Some((*label, PartModel::new(s, &[])?))).collect();
         Self {
             root,
+            root_is_world: false,
             use_tool,
             models,
             reference,

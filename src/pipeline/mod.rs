@@ -6,9 +6,11 @@ mod learner;
 mod poses;
 mod posterior;
 mod windows;
+mod worker;
 mod working_frame;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
 
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
@@ -16,6 +18,7 @@ pub use explain::Frame;
 pub use poses::PoseSettings;
 pub use learner::{Learner, ParentEvidence, WindowJob};
 pub use windows::{FrameAssembler, WindowCutter, WindowSettings};
+pub use worker::{ClosedWindow, Learned, Worker};
 
 use crate::math::Pose;
 use crate::model::{DynamicsLearner, KinematicSettings, PoseMeasurement};
@@ -51,6 +54,9 @@ pub struct PipelineSettings {
     pub predict: bool,
     /// For prediction, a posterior counts from its window's close plus this \[s\].
     pub posterior_latency_s: f64,
+    /// The stream does not wait: closed windows are handed out for a [`Worker`] to learn, and
+    /// predictions hold the last wrench instead of waiting for the next.
+    pub live: bool,
 }
 
 /// What the pipeline says.
@@ -79,6 +85,8 @@ pub enum Output {
         /// Covariance of its centre of mass, held fixed in the part \[m²\].
         covariance_m2: Matrix3<f64>,
     },
+    /// A window closed, for a [`Worker`] to learn; only if live.
+    WindowClosed(Box<ClosedWindow>),
     /// A window was learned.
     Learned {
         /// Seconds since time zero of its first and last frame.
@@ -97,18 +105,19 @@ pub struct Pipeline {
     cutter: Option<WindowCutter>,
     accumulators: BTreeMap<Label, SurfelAccumulator>,
     reference: Vec<Frame>,
-    learner: Option<Learner>,
+    learner: Option<Arc<Learner>>,
     current: BTreeMap<Label, Pose>,
     recent: Vec<BTreeMap<Label, Pose>>,
     moving: bool,
+    /// Where the parts were when each window closed that was handed out and is not adopted yet.
+    handed_out: VecDeque<BTreeMap<Label, Pose>>,
     forecaster: Option<Forecaster>,
 }
 
 impl Pipeline {
     /// A pipeline that has seen nothing.
     pub fn new(settings: PipelineSettings) -> Self {
-        let forecaster =
-            settings.predict.then(|| Forecaster::new(settings.root, settings.use_tool, settings.posterior_latency_s));
+        let forecaster = settings.predict.then(|| Forecaster::new(&settings));
         Self {
             forecaster,
             poses: PoseBuffer::new(settings.poses),
@@ -124,12 +133,13 @@ impl Pipeline {
             current: BTreeMap::new(),
             recent: Vec::new(),
             moving: false,
+            handed_out: VecDeque::new(),
         }
     }
 
     /// What has been learned; `None` before the first window.
     pub fn learner(&self) -> Option<&Learner> {
-        self.learner.as_ref()
+        self.learner.as_deref()
     }
 
     /// One input, in the working frame.
@@ -167,7 +177,7 @@ impl Pipeline {
             outputs.extend(self.push_frame(stamp, &[]));
         }
         let job = self.cutter.as_mut().and_then(|c| c.flush(nearest_label));
-        outputs.extend(job.map(|job| self.learn(&job)));
+        outputs.extend(job.and_then(|job| self.close(job)));
         outputs.extend(self.forecaster.iter_mut().flat_map(Forecaster::finish));
         outputs
     }
@@ -206,14 +216,14 @@ impl Pipeline {
         if self.learner.is_none() && self.cutter.as_ref().is_some_and(WindowCutter::is_open) {
             self.open_reference();
         }
-        let closed = job.is_some();
-        outputs.extend(job.map(|job| self.learn(&job)));
+        let closed = job.is_some() && !self.settings.live;
+        outputs.extend(job.and_then(|job| self.close(job)));
         if let (Some(forecaster), Some(frame)) = (&mut self.forecaster, seen) {
-            if let Some(learner) = self.learner.as_ref().filter(|_| closed) {
-                forecaster.learned(learner);
+            if let Some(learner) = self.learner.as_deref().filter(|_| closed) {
+                forecaster.learned(learner, None);
             }
             let rest_force = self.cutter.as_ref().and_then(WindowCutter::rest_force).unwrap_or_default();
-            outputs.extend(forecaster.push_frame(frame, self.learner.as_ref(), zero, rest_force));
+            outputs.extend(forecaster.push_frame(frame, self.learner.as_deref(), zero, rest_force));
         }
         outputs
     }
@@ -237,21 +247,42 @@ impl Pipeline {
         learner.settings = self.settings.kinematics;
         learner.dynamics = DynamicsLearner::new(self.gravity_in_work());
         learner.calibrate(&self.reference);
+        learner.root_is_world = self.settings.root.is_none() && largest.is_none();
         for (label, part) in posed {
             learner.add_posed(label, part);
         }
         self.reference.clear();
-        self.learner = Some(learner);
+        self.learner = Some(Arc::new(learner));
     }
 
-    fn learn(&mut self, job: &WindowJob) -> Output {
-        let ends = |f: Option<&Frame>| f.map_or(0.0, |f| f.time_s);
-        let span_s = (ends(job.frames.first()), ends(job.frames.last()));
-        if let Some(learner) = &mut self.learner {
-            learner.learn(job);
-            self.current.extend(learner.displacements.iter().map(|(l, d)| (*l, *d)));
+    /// A window that closed is learned here, or handed out if live.
+    fn close(&mut self, job: WindowJob) -> Option<Output> {
+        let learner = self.learner.as_mut()?;
+        if self.settings.live {
+            self.handed_out.push_back(self.current.clone());
+            return Some(Output::WindowClosed(Box::new(ClosedWindow::new(job, Arc::clone(learner)))));
         }
-        Output::Learned { span_s }
+        Arc::make_mut(learner).learn(&job);
+        self.current.extend(learner.displacements.iter().map(|(l, d)| (*l, *d)));
+        Some(Output::Learned { span_s: job.span_s() })
+    }
+
+    /// Takes over what a worker learned from the oldest window handed out. Parts go on from where
+    /// learning has them at the window's close, as far as they were seen to go since.
+    pub fn adopt(&mut self, learned: &Learned) -> Output {
+        let at_close = self.handed_out.pop_front().unwrap_or_default();
+        for (label, learned_pose) in &learned.learner.displacements {
+            let since = match (at_close.get(label), self.current.get(label)) {
+                (Some(before), Some(now)) if before != now => *now * before.inverse(),
+                _ => Pose::identity(),
+            };
+            self.current.insert(*label, since * *learned_pose);
+        }
+        self.learner = Some(Arc::clone(&learned.learner));
+        if let Some(forecaster) = &mut self.forecaster {
+            forecaster.learned(&learned.learner, Some(&self.current));
+        }
+        Output::Learned { span_s: learned.span_s }
     }
 
     /// Registers every part of a frame, from where it was.

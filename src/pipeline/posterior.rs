@@ -9,6 +9,7 @@ use super::poses::POSED_RADIUS;
 use crate::geometry::{HullProperties, hull_properties};
 use crate::mechanism::JointType;
 use crate::model::{Axis, DynamicsPosterior, JointDynamics, KinematicFit, WindowInference, WindowObservations};
+use crate::registration::PartModel;
 use crate::structure::TreeDistribution;
 use crate::types::Label;
 use crate::types::posterior::{
@@ -25,75 +26,74 @@ const CENTER_SHARE: f64 = 0.3;
 impl Pipeline {
     /// What is believed now, in the working frame.
     pub(super) fn posterior_in_work(&self) -> Option<ObjectPosterior> {
-        let points = self.points();
-        let posed = self.posed_origins();
-        if points.is_empty() && posed.is_empty() {
-            return None;
-        }
-        let largest = || points.iter().max_by_key(|(_, points)| points.len()).map(|(label, _)| *label);
-        let root = match (&self.learner, self.settings.root) {
-            (Some(learner), _) => learner.root_or_still(self.settings.root),
-            (None, Some(root)) => root,
-            (None, None) => largest().or_else(|| posed.keys().next().copied())?,
-        };
-        let labels: Vec<Label> = points.keys().chain(posed.keys()).copied().collect();
-        let mut parts: Vec<PartPosterior> = points.iter().filter_map(|(label, points)| part(*label, points)).collect();
-        parts.extend(posed.iter().map(|(label, origin)| posed_part(*label, origin)));
-        parts.sort_by_key(|part| part.label);
-        let dynamics = self.learner.as_ref().and_then(|learner| learner.dynamics.posterior().ok());
-        for learned in dynamics.iter().flat_map(|dynamics| &dynamics.parts) {
-            if let Some(part) = parts.iter_mut().find(|part| part.label == learned.label) {
-                part.com_in_world_m = learned.com_in_world.into();
-                part.com_covariance_m2 = learned.com_covariance.into();
-                part.mass_kg = learned.mass.clone();
-            }
-        }
-        let known = self.learner.as_ref().map(|learner| Known { learner, dynamics: dynamics.as_ref() });
-        Some(ObjectPosterior {
-            root_label: root,
-            parts,
-            edges: edges(root, &labels, known),
-            windows: self.learner.as_ref().map(window_records).unwrap_or_default(),
-            criticism: Criticism::insufficient(),
-        })
-    }
-
-    /// Points of each part's surface at the reference configuration \[m\].
-    fn points(&self) -> BTreeMap<Label, Vec<Vector3<f64>>> {
         if let Some(learner) = &self.learner {
-            return learner
-                .models
-                .iter()
-                .filter(|(label, _)| !learner.posed.contains_key(label))
-                .map(|(label, model)| (*label, model.surfels.iter().map(|s| s.point).collect()))
-                .collect();
+            return Some(learner.posterior());
         }
-        let mut points: BTreeMap<Label, Vec<Vector3<f64>>> = BTreeMap::new();
+        let mut parts = Parts::default();
         let last = self.reference.last().into_iter().flat_map(|frame| &frame.scans);
         for (label, scan) in last {
-            points.entry(*label).or_default().extend(scan.iter().map(|p| p.point_in_world));
+            parts.surfaces.entry(*label).or_default().extend(scan.iter().map(|p| p.point_in_world));
         }
-        points
-    }
-
-    /// Where the frames of parts that a topic measures were at first \[m\].
-    fn posed_origins(&self) -> BTreeMap<Label, Vector3<f64>> {
-        if let Some(learner) = &self.learner {
-            return learner.posed.iter().map(|(label, part)| (*label, part.world_from_frame.translation)).collect();
-        }
-        let first = self.reference.iter().rev().flat_map(|frame| &frame.poses);
-        first.map(|(label, seen)| (*label, seen.world_from_frame.translation)).collect()
+        let posed = self.reference.iter().rev().flat_map(|frame| &frame.poses);
+        parts.origins = posed.map(|(label, seen)| (*label, seen.world_from_frame.translation)).collect();
+        let likeliest = || parts.surfaces.iter().max_by_key(|(_, points)| points.len()).map(|(label, _)| *label);
+        let root = self.settings.root.or_else(likeliest).or_else(|| parts.origins.keys().next().copied())?;
+        (!parts.surfaces.is_empty() || !parts.origins.is_empty()).then(|| posterior(root, &parts, None))
     }
 }
 
 impl Learner {
-    /// The root: as given, or the part taken for it; if that is none of the parts, one that never moved
-    /// while others did.
-    fn root_or_still(&self, given: Option<Label>) -> Label {
-        if given.is_some() || self.models.contains_key(&self.root) || self.evidence.is_empty() {
+    /// What is believed by what was learned.
+    pub(super) fn posterior(&self) -> ObjectPosterior {
+        let seen = self.models.iter().filter(|(label, _)| !self.posed.contains_key(label));
+        let surface = |model: &PartModel| model.surfels.iter().map(|s| s.point).collect();
+        let parts = Parts {
+            surfaces: seen.map(|(label, model)| (*label, surface(model))).collect(),
+            origins: self.posed.iter().map(|(label, part)| (*label, part.world_from_frame.translation)).collect(),
+        };
+        posterior(self.root_or_still(), &parts, Some(self))
+    }
+
+    /// The root; where that is only a name for the world, a part that never moved while others did.
+    fn root_or_still(&self) -> Label {
+        if !self.root_is_world || self.evidence.is_empty() {
             return self.root;
         }
         self.models.keys().copied().find(|label| !self.evidence.contains_key(label)).unwrap_or(self.root)
+    }
+}
+
+/// All parts at the reference configuration \[m\].
+#[derive(Default)]
+struct Parts {
+    /// Points of the surface of those that clouds show.
+    surfaces: BTreeMap<Label, Vec<Vector3<f64>>>,
+    /// Origins of the frames of those that a topic measures.
+    origins: BTreeMap<Label, Vector3<f64>>,
+}
+
+fn posterior(root_label: Label, seen: &Parts, learner: Option<&Learner>) -> ObjectPosterior {
+    let labels: BTreeSet<Label> = seen.surfaces.keys().chain(seen.origins.keys()).copied().collect();
+    let labels: Vec<Label> = labels.into_iter().collect();
+    let mut parts: Vec<PartPosterior> =
+        seen.surfaces.iter().filter_map(|(label, points)| part(*label, points)).collect();
+    parts.extend(seen.origins.iter().map(|(label, origin)| posed_part(*label, origin)));
+    parts.sort_by_key(|part| part.label);
+    let dynamics = learner.and_then(|learner| learner.dynamics.posterior().ok());
+    for learned in dynamics.iter().flat_map(|dynamics| &dynamics.parts) {
+        if let Some(part) = parts.iter_mut().find(|part| part.label == learned.label) {
+            part.com_in_world_m = learned.com_in_world.into();
+            part.com_covariance_m2 = learned.com_covariance.into();
+            part.mass_kg = learned.mass.clone();
+        }
+    }
+    let known = learner.map(|learner| Known { learner, dynamics: dynamics.as_ref() });
+    ObjectPosterior {
+        root_label,
+        parts,
+        edges: edges(root_label, &labels, known),
+        windows: learner.map(window_records).unwrap_or_default(),
+        criticism: Criticism::insufficient(),
     }
 }
 
@@ -138,7 +138,8 @@ fn window_records(learner: &Learner) -> Vec<WindowRecord> {
 }
 
 fn window_record(window: &WindowObservations, inference: Option<&WindowInference>) -> WindowRecord {
-    let touched: BTreeSet<Label> = window.contacts.iter().map(|contact| contact.label).collect();
+    let mut touched: BTreeSet<Label> = window.contacts.iter().map(|contact| contact.label).collect();
+    touched.extend(window.wrenches.iter().filter(|wrench| !wrench.tool).filter_map(|wrench| wrench.part));
     let end = |time: Option<&f64>| time.copied().unwrap_or_default();
     let learned = inference.filter(|inference| inference.failure.is_none());
     WindowRecord {

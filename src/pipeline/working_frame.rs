@@ -137,6 +137,7 @@ fn carried_output(output: Output, world_from_work: &Pose) -> Output {
             let covariance_m2 = world_from_work.rotation * covariance_m2 * world_from_work.rotation.transpose();
             Output::Prediction { time_s, horizon_s, label, displacement, covariance_m2 }
         }
+        Output::WindowClosed(window) => Output::WindowClosed(Box::new(window.carried_out(world_from_work))),
         Output::Learned { span_s } => Output::Learned { span_s },
     }
 }

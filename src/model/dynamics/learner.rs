@@ -80,6 +80,7 @@ struct WindowMemory {
 }
 
 /// Learns the dynamics from windows, given the kinematic fit of all of them.
+#[derive(Clone)]
 pub struct DynamicsLearner {
     gravity: Vector3<f64>,
     pub(super) belief: Belief<Block, usize>,

@@ -208,7 +208,8 @@ pub fn joint_track(source: &TrackSource<'_>, kinematics: &TrackKinematics) -> Op
         };
         let samples = own.iter().filter(in_contact).map(|w| sample(w, kinematics.tool_offset)).collect();
         let drive = Drive::new(touch.joint, samples);
-        drives.push(Drive { samples: with_ends(drive.samples), ..drive });
+        // What its torque's noise does to the joints is next to nothing beside what its force's does.
+        drives.push(Drive { samples: with_ends(drive.samples), torque_deviation: 0.0, ..drive });
         if source.use_tool {
             let tool: Vec<(f64, Vector3<f64>)> = own
                 .iter()
