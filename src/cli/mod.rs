@@ -1,5 +1,6 @@
 //! Subcommands, their options, logging.
 
+mod import;
 mod progress;
 mod replay;
 
@@ -27,6 +28,7 @@ pub struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Command {
     Replay(replay::ReplayArguments),
+    Import(import::ImportArguments),
 }
 
 /// Does what was asked.
@@ -34,6 +36,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     start_logging(arguments.log_level.as_deref())?;
     match &arguments.command {
         Command::Replay(arguments) => replay::run(arguments),
+        Command::Import(arguments) => import::run(arguments),
     }
 }
 

@@ -26,7 +26,7 @@ use crate::registration::{AlignmentSettings, Quadratic, SurfelAccumulator, align
 use crate::types::{Input, Label, Stamp};
 use explain::{FEWEST_POINTS, measurement_of, travel};
 use forecast::Forecaster;
-use poses::{POSED_RADIUS, PoseBuffer, PosedPart, references};
+use poses::{POSED_RADIUS, PoseBuffer, PosedPart, RECORD_GAP, references};
 use windows::frame_of;
 use working_frame::WorkingFrame;
 
@@ -101,6 +101,7 @@ pub struct Pipeline {
     zero: Option<Stamp>,
     assembler: FrameAssembler,
     poses: PoseBuffer,
+    last_frame_s: Option<f64>,
     early: Vec<Input>,
     cutter: Option<WindowCutter>,
     accumulators: BTreeMap<Label, SurfelAccumulator>,
@@ -121,6 +122,7 @@ impl Pipeline {
         Self {
             forecaster,
             poses: PoseBuffer::new(settings.poses),
+            last_frame_s: None,
             settings,
             working_frame: WorkingFrame::Open(Vec::new()),
             zero: None,
@@ -195,10 +197,15 @@ impl Pipeline {
             }
         }
         let mut frame = frame_of(stamp.seconds_since(zero), clouds);
+        let mut outputs = Vec::new();
+        if clouds.is_empty() && self.last_frame_s.is_some_and(|last_s| frame.time_s - last_s > RECORD_GAP) {
+            outputs.extend(self.end_record());
+        }
+        self.last_frame_s = Some(frame.time_s);
         frame.scans.retain(|label, _| !self.poses.measures(*label));
         frame.poses = self.poses.at(stamp);
         frame.moves = self.poses.something_moves(frame.time_s, &frame.poses);
-        let mut outputs = self.observe(&frame);
+        outputs.extend(self.observe(&frame));
         let moving = self.moving;
         let seen = self.forecaster.is_some().then(|| frame.clone());
         if !self.cutter.as_ref().is_some_and(WindowCutter::is_open) && self.learner.is_none() {
@@ -226,6 +233,17 @@ impl Pipeline {
             outputs.extend(forecaster.push_frame(frame, self.learner.as_deref(), zero, rest_force));
         }
         outputs
+    }
+
+    /// Poses stayed away: the window that is open ends with the last of them.
+    fn end_record(&mut self) -> Option<Output> {
+        self.poses.end_record();
+        let job = self.cutter.as_mut().and_then(|cutter| cutter.end_record(nearest_label))?;
+        let output = self.close(job);
+        if let (Some(forecaster), Some(learner), false) = (&mut self.forecaster, &self.learner, self.settings.live) {
+            forecaster.learned(learner, None);
+        }
+        output
     }
 
     /// The object at rest has been seen: its models are made, just before the first window.

@@ -31,6 +31,8 @@ const MOTION_SCORE: f64 = 30.0;
 const MOST_REFERENCES: usize = 250;
 /// Frames of the last look before a window that may already see motion \[s\].
 const REFERENCE_MARGIN: f64 = 0.5;
+/// Poses that stay away this long go on as another record: nothing is known of the time between \[s\].
+pub const RECORD_GAP: f64 = 1.0;
 /// Travel below this is rest however small the noise is stated to be \[m\].
 const RESTS_WITHIN: f64 = 0.0005;
 
@@ -191,6 +193,11 @@ impl PoseBuffer {
             }
         }
         seen
+    }
+
+    /// What comes is not compared with what was.
+    pub fn end_record(&mut self) {
+        self.recent.clear();
     }
 
     /// Whether a part of a frame is away from where it was a short while ago, beyond its noise.

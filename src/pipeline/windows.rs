@@ -228,6 +228,13 @@ impl WindowCutter {
         Some(self.close(now, nearest))
     }
 
+    /// Ends a record: a window that is open closes, and what comes is not joined to what was.
+    pub fn end_record(&mut self, nearest: impl Fn(&Vector3<f64>, &Frame) -> Option<Label>) -> Option<WindowJob> {
+        let job = self.flush(nearest);
+        self.frames.clear();
+        job
+    }
+
     fn forget(&mut self, before_s: f64) {
         while self.frames.front().is_some_and(|f| f.time_s < before_s) {
             self.frames.pop_front();

@@ -30,6 +30,8 @@ const FRICTION_SPAN_S: f64 = 0.02;
 /// Standard deviation of the first position \[m or rad\] and rate \[m/s or rad/s\].
 const FIRST_POSITION: f64 = 0.02;
 const FIRST_RATE: f64 = 0.1;
+/// The same of a rate that the window opens with, in shares of it.
+const FIRST_RATE_SHARE: f64 = 0.1;
 
 /// The model of one window.
 #[derive(Clone, Debug)]
@@ -112,7 +114,7 @@ impl WindowModel<'_> {
         let mut covariance = DMatrix::from_fn(2 * n, 2 * n, |i, j| match (i == j, i < n) {
             (false, _) => 0.0,
             (true, true) => FIRST_POSITION.powi(2),
-            (true, false) => FIRST_RATE.powi(2),
+            (true, false) => FIRST_RATE.powi(2) + (FIRST_RATE_SHARE * state[i]).powi(2),
         });
         let mut result = Innovations::default();
         for (k, observation) in observations.iter().enumerate() {
@@ -288,8 +290,18 @@ impl WindowModel<'_> {
             }
             let step = self.track.positions[ahead][i - n] - first[i - n];
             // Positions of a joint at rest are equal, as the kinematic fit ties them.
-            if step.abs() > 0.02 && span_s > 0.0 { step / span_s } else { 0.0 }
+            if step.abs() > 0.02 && span_s > 0.0 { self.first_rate(i - n, ahead) } else { 0.0 }
         })
+    }
+
+    /// Slope at the first observation of the parabola through it, the one `ahead` of it and the middle one.
+    fn first_rate(&self, i: usize, ahead: usize) -> f64 {
+        let point = |k: usize| {
+            let span_s = self.track.observations[k].time_s - self.track.observations[0].time_s;
+            (span_s, self.track.positions[k][i] - self.track.positions[0][i])
+        };
+        let ((t1, x1), (t2, x2)) = (point(ahead.div_ceil(2)), point(ahead));
+        if t1 > 0.0 && t2 > t1 { (x1 * t2 / t1 - x2 * t1 / t2) / (t2 - t1) } else { x2 / t2 }
     }
 }
 
