@@ -177,8 +177,12 @@ fn noisy_poses_and_forces_tell_the_hinge() {
         let force = across * (efforts[0] / across.norm_squared());
         let force = force.map(|f| f + noise.draw(0.05));
         let q = rotation.coords;
-        writeln!(table, "{t},{},{},{},{},{},{},{},{},{},{}", x.x, x.y, x.z, q.x, q.y, q.z, q.w, force.x, force.y, force.z)
-            .unwrap();
+        writeln!(
+            table,
+            "{t},{},{},{},{},{},{},{},{},{},{}",
+            x.x, x.y, x.z, q.x, q.y, q.z, q.w, force.x, force.y, force.z
+        )
+        .unwrap();
     }
     let spec = "[time]\ncolumn = \"t\"\n[[parts]]\nlabel = 7\nposition = [\"x\", \"y\", \"z\"]\n\
                 orientation = [\"qx\", \"qy\", \"qz\", \"qw\"]\nnoise = { position_m = 0.001, rotation_rad = 0.002 }\n\
@@ -254,10 +258,9 @@ fn torques_between_two_links_tell_the_chain() {
         assert!(degrees_between(axis.axis_direction, Vector3::y()) < 0.1, "{axis:?}");
         assert!(axis_miss(axis.axis_direction, axis.axis_point_m, point) < 0.001, "{axis:?}");
     }
-    for (child, inertia, friction) in [
-        (1, machine.tree.joint_inertia(0), 0.08),
-        (2, machine.tree.joint_inertia(1), 0.05),
-    ] {
+    for (child, inertia, friction) in
+        [(1, machine.tree.joint_inertia(0), 0.08), (2, machine.tree.joint_inertia(1), 0.05)]
+    {
         let edge = edge(&posterior, child);
         assert!((edge.joint_inertia.median / inertia - 1.0).abs() < 0.1, "{inertia}: {edge:?}");
         assert!((edge.friction.median / friction - 1.0).abs() < 0.25, "{friction}: {edge:?}");
@@ -283,15 +286,35 @@ fn errors_name_file_column_and_line() {
     assert_eq!(outcome(table, spec, &[]).status, 0);
     assert_eq!(outcome(table, spec, &["--split", "fit"]).status, 0);
     for (bad, spec, more, expected) in [
-        ("t,x,y,z\n0,1,2,3\n1,1,two,3\n", spec.to_owned(), &[][..], "table.csv: line 3, column `y`: `two`, expected a number"),
-        ("t,x,y,z\n0,1,2,3\n1,1,2,nan\n", spec.to_owned(), &[], "table.csv: line 3, column `z`: `nan`, expected a number"),
-        ("t,x,y,z\n1,1,2,3\n0,1,2,3\n", spec.to_owned(), &[], "table.csv: line 3, column `t`: 0 s after 1 s, expected a later"),
+        (
+            "t,x,y,z\n0,1,2,3\n1,1,two,3\n",
+            spec.to_owned(),
+            &[][..],
+            "table.csv: line 3, column `y`: `two`, expected a number",
+        ),
+        (
+            "t,x,y,z\n0,1,2,3\n1,1,2,nan\n",
+            spec.to_owned(),
+            &[],
+            "table.csv: line 3, column `z`: `nan`, expected a number",
+        ),
+        (
+            "t,x,y,z\n1,1,2,3\n0,1,2,3\n",
+            spec.to_owned(),
+            &[],
+            "table.csv: line 3, column `t`: 0 s after 1 s, expected a later",
+        ),
         ("t,x,y\n0,1,2\n", spec.to_owned(), &[], "table.csv: column `z`: not in the table, which has t, x, y"),
         ("t,x,y,z\n", spec.to_owned(), &[], "table.csv: no rows"),
         ("t,x,y,z\n0,1,2\n", spec.to_owned(), &[], "table.csv: CSV error: record 1 (line: 2"),
         (table, spec.replace("position_m", "position"), &[], "spec.toml: key `parts[0].noise.position`: unknown field"),
         (table, spec.replace("0.001", "-0.001"), &[], "spec.toml: key `parts[0].noise`: expected above 0"),
-        (table, spec.replace("column = \"t\"", ""), &[], "spec.toml: key `time`: expected either `column` or `rate_hz`"),
+        (
+            table,
+            spec.replace("column = \"t\"", ""),
+            &[],
+            "spec.toml: key `time`: expected either `column` or `rate_hz`",
+        ),
         (table, spec.to_owned(), &["--split", "test"], "--split test: "),
         (table, spec.to_owned(), &["--select", "x=7"], "table.csv: column `x`: no row holds `7`; it holds 1"),
     ] {

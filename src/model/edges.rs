@@ -210,7 +210,10 @@ pub fn axes_from_motion(part: &EdgePart, joint_type: JointType, windows: &[Windo
             _ => fit_circle(&points),
         };
         let seed = seed.map(|(seed, _)| seed);
-        return seed.map(|s| Axis { direction: s.direction, point: s.point.unwrap_or(part.center) }).into_iter().collect();
+        return seed
+            .map(|s| Axis { direction: s.direction, point: s.point.unwrap_or(part.center) })
+            .into_iter()
+            .collect();
     }
     let shift = second.transform_point(&part.center) - first.transform_point(&part.center);
     match joint_type {

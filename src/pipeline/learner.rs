@@ -5,8 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use nalgebra::{DMatrix, Vector3};
 use rayon::prelude::*;
 
-use super::poses::{POSED_RADIUS, PosedPart, measured_motion};
 use super::explain::{Baseline, Frame, Motion, Scene, explain_window, measure_faces, travel};
+use super::poses::{POSED_RADIUS, PosedPart, measured_motion};
 use crate::geometry::{HullProperties, hull_properties};
 use crate::math::Pose;
 use crate::mechanism::JointType;

@@ -15,8 +15,8 @@ use std::sync::Arc;
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
 pub use explain::Frame;
-pub use poses::PoseSettings;
 pub use learner::{Learner, ParentEvidence, WindowJob};
+pub use poses::PoseSettings;
 pub use windows::{FrameAssembler, WindowCutter, WindowSettings};
 pub use worker::{ClosedWindow, Learned, Worker};
 

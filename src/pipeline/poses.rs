@@ -10,8 +10,8 @@ use std::collections::{BTreeMap, VecDeque};
 use nalgebra::{DMatrix, Matrix3, Matrix6, Vector3, Vector6};
 use serde::{Deserialize, Serialize};
 
-use super::explain::Motion;
 use super::Frame;
+use super::explain::Motion;
 use crate::math::Pose;
 use crate::model::PoseMeasurement;
 use crate::types::{Label, MeasuredPose, Stamp};
@@ -181,11 +181,8 @@ impl PoseBuffer {
     pub fn at(&mut self, stamp: Stamp) -> BTreeMap<Label, SeenPose> {
         self.last_frame = self.last_frame.max(Some(stamp));
         let half_s = 0.5 / self.settings.rate_hz;
-        let seen = self
-            .tracks
-            .iter()
-            .filter_map(|(label, track)| Some((*label, pose_at(track, stamp, half_s)?)))
-            .collect();
+        let seen =
+            self.tracks.iter().filter_map(|(label, track)| Some((*label, pose_at(track, stamp, half_s)?))).collect();
         let old = stamp.plus_seconds(-2.0 * LONGEST_GAP.max(half_s));
         for track in self.tracks.values_mut() {
             while track.front().is_some_and(|pose| pose.stamp < old) {
@@ -223,7 +220,8 @@ impl PoseBuffer {
 
 /// A part's pose at a stamp, from the poses within half a bin of it or around it.
 fn pose_at(track: &VecDeque<MeasuredPose>, stamp: Stamp, half_s: f64) -> Option<SeenPose> {
-    let seen = |pose: &MeasuredPose| SeenPose { world_from_frame: pose.world_from_frame, information: pose.information };
+    let seen =
+        |pose: &MeasuredPose| SeenPose { world_from_frame: pose.world_from_frame, information: pose.information };
     let after = track.partition_point(|pose| pose.stamp < stamp);
     let low = track.partition_point(|pose| pose.stamp < stamp.plus_seconds(-half_s));
     let high = track.partition_point(|pose| pose.stamp <= stamp.plus_seconds(half_s));
@@ -403,7 +401,8 @@ mod tests {
     #[test]
     fn few_poses_are_taken_as_they_are() {
         let mut buffer = PoseBuffer::new(PoseSettings::default());
-        let stamps: Vec<Stamp> = (0..20).flat_map(|i| buffer.push(pose(f64::from(i) * 0.1, f64::from(i), 0.01))).collect();
+        let stamps: Vec<Stamp> =
+            (0..20).flat_map(|i| buffer.push(pose(f64::from(i) * 0.1, f64::from(i), 0.01))).collect();
         assert_eq!(stamps.len(), 19);
         let seen = buffer.at(Stamp(1_000_000_000));
         assert_eq!(seen[&Label(1)].world_from_frame.translation.x, 10.0);

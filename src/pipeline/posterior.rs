@@ -4,8 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{DMatrix, Matrix3, Vector3};
 
-use super::{Learner, ParentEvidence, Pipeline};
 use super::poses::POSED_RADIUS;
+use super::{Learner, ParentEvidence, Pipeline};
 use crate::geometry::{HullProperties, hull_properties};
 use crate::mechanism::JointType;
 use crate::model::{Axis, DynamicsPosterior, JointDynamics, KinematicFit, WindowInference, WindowObservations};

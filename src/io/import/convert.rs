@@ -42,12 +42,7 @@ pub struct Imported {
 ///
 /// # Errors
 /// If the table is not what the spec says (with column and line), or the bag cannot be written.
-pub fn import(
-    table: Table,
-    spec: &ImportSpec,
-    split: Option<&SplitSpec>,
-    bag: &Path,
-) -> Result<Imported, ImportError> {
+pub fn import(table: Table, spec: &ImportSpec, split: Option<&SplitSpec>, bag: &Path) -> Result<Imported, ImportError> {
     let rows_in = table.len();
     let mut table = table;
     for (column, text) in &spec.select {
@@ -211,8 +206,7 @@ impl<'a> Machine<'a> {
         for part in &self.parts {
             let spec = part.spec;
             let (table_from_frame, axis) = if let (Some(joint), Some(column)) = (&spec.joint, &part.joint) {
-                let parent =
-                    spec.parent.and_then(|p| displacements.get(&p)).copied().unwrap_or_else(Pose::identity);
+                let parent = spec.parent.and_then(|p| displacements.get(&p)).copied().unwrap_or_else(Pose::identity);
                 let direction = unit(&joint.axis).unwrap_or_else(Vector3::z);
                 let screw = match joint.joint_type {
                     MovingType::Prismatic => Screw::prismatic(&direction),

@@ -264,8 +264,8 @@ impl WindowModel<'_> {
         let tracks: Vec<WrenchTrack<'_, T>> =
             self.track.drives.iter().map(|d| WrenchTrack::new(d.joint, within(&d.samples, span))).collect();
         let step_s = if n > 1 { CHAIN_STEP_S } else { STEP_S };
-        let run = rollout(tree, &State::new(positions, rates), &tracks, &span, step_s)
-            .map_err(|_| Failure::Diverged)?;
+        let run =
+            rollout(tree, &State::new(positions, rates), &tracks, &span, step_s).map_err(|_| Failure::Diverged)?;
         let (positions, rates) = (run.positions(1), run.rates(1));
         Ok(self.moving.iter().map(|&j| positions[j]).chain(self.moving.iter().map(|&j| rates[j])).collect())
     }

@@ -20,6 +20,8 @@ const REST_ANGLE: f64 = 0.015;
 /// Linearizations for one window at most, and for all revisits after a window.
 const STEPS: usize = 14;
 const REVISIT_STEPS: usize = 12;
+/// A joint that stops at an end of its range stays there as long \[s\].
+const SHORTEST_HALT: f64 = 0.1;
 /// A stop is believed if it raises the log evidence by this.
 const STOP_EVIDENCE: f64 = 4.0;
 
@@ -207,7 +209,11 @@ impl DynamicsLearner {
         let default = JointScales { force: 1.0, rate: 0.2 };
         let scales: Vec<_> = fit.joints.iter().map(|j| memory(j).and_then(|m| m.scales).unwrap_or(default)).collect();
         let stops: Vec<_> = fit.joints.iter().map(|j| memory(j).map_or([false; 2], |m| m.stops)).collect();
-        let hull = |joint: &KinematicJoint| memory(joint).and_then(|m| m.hull.clone()).unwrap_or_else(|| HullProperties::guess(joint.center, joint.radius.max(0.05)));
+        let hull = |joint: &KinematicJoint| {
+            memory(joint)
+                .and_then(|m| m.hull.clone())
+                .unwrap_or_else(|| HullProperties::guess(joint.center, joint.radius.max(0.05)))
+        };
         let mut models = joint_models(&fit.joints, hull, &scales, &stops, &self.gravity);
         for model in &mut models {
             let label = model.joint.child;
@@ -290,12 +296,7 @@ impl DynamicsLearner {
 
     /// Which joints move in a window, and where the others rest.
     /// Joints in branches that no wrench acts on are left out: nothing known drives them.
-    fn moving(
-        &self,
-        window: usize,
-        fit: &KinematicFit,
-        input: &DynamicsInput<'_>,
-    ) -> (Vec<usize>, Vec<Option<f64>>) {
+    fn moving(&self, window: usize, fit: &KinematicFit, input: &DynamicsInput<'_>) -> (Vec<usize>, Vec<Option<f64>>) {
         let root = |mut k: usize| {
             while let Some(p) = fit.joints[k].parent {
                 k = p;
@@ -361,9 +362,8 @@ impl DynamicsLearner {
 
     /// |Sᵀ w| of the samples on a joint, at the reference configuration of its ancestors.
     fn generalized_forces(&self, joint: usize, fit: &KinematicFit, track: &super::track::JointTrack) -> Vec<f64> {
-        let carries = |drive: &&Drive| {
-            std::iter::successors(Some(drive.joint), |&k| fit.joints[k].parent).any(|k| k == joint)
-        };
+        let carries =
+            |drive: &&Drive| std::iter::successors(Some(drive.joint), |&k| fit.joints[k].parent).any(|k| k == joint);
         let acting: Vec<&Drive> = track.drives.iter().filter(carries).collect();
         let Some(first) = acting.iter().max_by_key(|drive| drive.samples.len()) else { return Vec::new() };
         let screw = fit.joints[joint].screw().0;
@@ -394,7 +394,7 @@ impl DynamicsLearner {
         let mut fitted = self.fit_window(window, fit, input, &moving, &frozen, (steps, None))?;
         let mut spent = fitted.1.steps;
         // Stops where the joint arrived at the end of its range.
-        let halts = if self.windows[window].learned { Vec::new() } else { self.halts(window, fit, &moving) };
+        let halts = if self.windows[window].learned { Vec::new() } else { self.halts(window, fit, &moving, input) };
         for (joint, side, position) in halts {
             let label = fit.joints[joint].child;
             let before = self.joints.get(&label).cloned();
@@ -459,7 +459,13 @@ impl DynamicsLearner {
     }
 
     /// The (joint, side, position) where a joint arrived at an end of all its positions so far.
-    fn halts(&self, window: usize, fit: &KinematicFit, moving: &[usize]) -> Vec<(usize, usize, f64)> {
+    fn halts(
+        &self,
+        window: usize,
+        fit: &KinematicFit,
+        moving: &[usize],
+        input: &DynamicsInput<'_>,
+    ) -> Vec<(usize, usize, f64)> {
         let mut halts = Vec::new();
         for &k in moving {
             let joint = &fit.joints[k];
@@ -476,7 +482,13 @@ impl DynamicsLearner {
                 let positions = &fit.positions[window][k];
                 let at_end = |i: usize| (positions[i] - end).abs() < near;
                 let arrival = (1..positions.len()).find(|&i| at_end(i) && !at_end(i - 1));
-                if arrival.is_some_and(|i| (i..positions.len()).take_while(|&i| at_end(i)).count() >= 2) {
+                let times_s = &input.windows[window].times_s;
+                // A swing turns round in less.
+                let stays = |from: usize| {
+                    let last = (from..positions.len()).take_while(|&i| at_end(i)).last();
+                    last.is_some_and(|last| times_s[last] - times_s[from] > 0.9 * SHORTEST_HALT)
+                };
+                if arrival.is_some_and(stays) {
                     halts.push((k, side, end));
                 }
             }

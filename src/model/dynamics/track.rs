@@ -148,7 +148,8 @@ impl TrackSource<'_> {
     fn touches(&self) -> Vec<Touch> {
         let touch = |(index, contact): (usize, &'_ Contact)| {
             let joint = self.joints.iter().position(|j| j.child == contact.label)?;
-            let (time, point) = (|k: usize| self.window.times_s.get(k).copied(), self.contact_points.get(index).copied());
+            let (time, point) =
+                (|k: usize| self.window.times_s.get(k).copied(), self.contact_points.get(index).copied());
             let span_s = (time(contact.track.first()?.0)?, time(contact.track.last()?.0)?);
             let mean = contact.track.iter().map(|(_, x, _)| x).sum::<Vector3<f64>>() / contact.track.len() as f64;
             Some(Touch { joint, label: contact.label, span_s, point, mean })
@@ -203,9 +204,8 @@ pub fn joint_track(source: &TrackSource<'_>, kinematics: &TrackKinematics) -> Op
         let own: Vec<&AppliedWrench> =
             readings.iter().copied().filter(|w| w.tool && contact_of(&touches, w) == Some(index)).collect();
         let (from_s, to_s) = touch.span_s;
-        let in_contact = |w: &&&AppliedWrench| {
-            (from_s - CONTACT_MARGIN_S..=to_s + CONTACT_MARGIN_S).contains(&seconds(w))
-        };
+        let in_contact =
+            |w: &&&AppliedWrench| (from_s - CONTACT_MARGIN_S..=to_s + CONTACT_MARGIN_S).contains(&seconds(w));
         let samples = own.iter().filter(in_contact).map(|w| sample(w, kinematics.tool_offset)).collect();
         let drive = Drive::new(touch.joint, samples);
         // What its torque's noise does to the joints is next to nothing beside what its force's does.
@@ -221,8 +221,7 @@ pub fn joint_track(source: &TrackSource<'_>, kinematics: &TrackKinematics) -> Op
     }
     for (joint, child) in source.joints.iter().map(|j| j.child).enumerate() {
         let acting = |w: &&&AppliedWrench| !w.tool && w.part == Some(child);
-        let samples: Vec<WrenchSample> =
-            readings.iter().filter(acting).map(|w| sample(w, Vector3::zeros())).collect();
+        let samples: Vec<WrenchSample> = readings.iter().filter(acting).map(|w| sample(w, Vector3::zeros())).collect();
         if !samples.is_empty() {
             drives.push(Drive::new(joint, samples));
         }
