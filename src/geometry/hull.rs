@@ -6,13 +6,14 @@
 use nalgebra::{Matrix3, Vector3};
 use parry3d_f64::mass_properties::MassProperties;
 use parry3d_f64::transformation::try_convex_hull;
+use serde::{Deserialize, Serialize};
 
 /// Thinnest plate that a flat cloud is taken for \[m\]: panels and doors of furniture are 15 mm to
 /// 25 mm, and a camera that sees one face cannot tell.
 const PLATE_THICKNESS: f64 = 0.018;
 
 /// Mass properties at unit density, uniform, of a part's convex hull.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct HullProperties {
     /// Volume \[m³\].
     pub volume: f64,

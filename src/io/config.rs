@@ -51,6 +51,8 @@ pub struct Config {
     pub input: InputConfig,
     /// A posterior counts from its window's close plus this, in stamp time \[s\].
     pub posterior_latency_s: f64,
+    /// `bom evaluate` simulates this far from what was seen \[s\].
+    pub evaluation_horizon_s: f64,
     /// When interaction windows open and close.
     pub windows: WindowSettings,
     /// How poses that a topic measures become observations.
@@ -68,6 +70,7 @@ impl Default for Config {
             gravity_m_s2: [0.0, 0.0, -9.81],
             input: InputConfig::default(),
             posterior_latency_s: 0.0,
+            evaluation_horizon_s: 1.0,
             windows: WindowSettings::default(),
             poses: PoseSettings::default(),
             observations: ObservationConfig::default(),
@@ -82,6 +85,7 @@ impl Config {
         PipelineSettings {
             root,
             use_tool: self.observations.tool_pose,
+            points_per_part: self.input.points_per_part,
             windows: self.windows,
             poses: self.poses,
             kinematics: self.kinematics,
@@ -131,6 +135,7 @@ impl Config {
         let positive = [
             ("windows.force_threshold_n", self.windows.force_threshold_n),
             ("windows.smoothing_s", self.windows.smoothing_s),
+            ("evaluation_horizon_s", self.evaluation_horizon_s),
             ("windows.quiet_s", self.windows.quiet_s),
             ("windows.longest_s", self.windows.longest_s),
             ("poses.rate_hz", self.poses.rate_hz),
@@ -139,6 +144,7 @@ impl Config {
             ("kinematics.shared_distance", self.kinematics.shared_distance),
             ("kinematics.rest_deviations", self.kinematics.rest_deviations),
             ("kinematics.student_freedom", self.kinematics.student_freedom),
+            ("windows.kept", self.windows.kept as f64),
             ("kinematics.steps", self.kinematics.steps as f64),
         ];
         positive.into_iter().try_for_each(|(key, value)| positive_number(key, value))?;
@@ -206,6 +212,8 @@ pub struct InputConfig {
     pub label_field: String,
     /// Labels that are no part (background): their points are left out.
     pub ignored_labels: Vec<Label>,
+    /// Points of a part that are used of a frame at most; 0: all.
+    pub points_per_part: usize,
     /// How far back moving transforms are kept \[s\].
     pub tf_history_s: f64,
     /// How far the stream may go on before a message that waits for its transform is dropped \[s\].
@@ -227,6 +235,7 @@ impl Default for InputConfig {
             fixed_frame: "world".into(),
             label_field: "label".into(),
             ignored_labels: Vec::new(),
+            points_per_part: 2500,
             tf_history_s: 10.0,
             tf_timeout_s: 1.0,
             default_pose_std: PoseStd::default(),

@@ -13,6 +13,7 @@ pub mod document;
 pub mod import;
 pub mod ingest;
 pub mod messages;
+pub mod model_file;
 pub mod output_file;
 pub mod point_cloud;
 mod point_field;

@@ -6,6 +6,8 @@ mod kinematics;
 mod window;
 
 pub use dynamics::{DynamicsInput, DynamicsLearner, DynamicsPosterior, JointDynamics, PartDynamics, WindowInference};
-pub use edges::{EdgeFit, EdgePart, axes_from_motion, moving_evidence, relative_windows, rigid_evidence};
+pub use edges::{
+    EdgeFit, EdgePart, axes_from_motion, moving_evidence, nearest_position, relative_windows, rigid_evidence,
+};
 pub use kinematics::{Axis, KinematicFit, KinematicJoint, KinematicSettings, fit_kinematics};
 pub use window::{Contact, PoseMeasurement, WindowObservations};

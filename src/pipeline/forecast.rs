@@ -216,6 +216,21 @@ impl Forecaster {
         self.waiting.push(new);
     }
 
+    /// Starts from a saved object whose joints are at `positions` now.
+    pub fn resumed(&mut self, learner: &Learner, now_s: f64, positions: Vec<f64>) {
+        let noise_scale = learner.inferences.last().map_or(1.0, |inference| inference.noise_scale);
+        let mechanism = learner.fit.as_ref().and_then(|fit| TrackedMechanism::new(fit, &learner.dynamics, noise_scale));
+        self.root = Some(learner.root);
+        self.waiting.push(Waiting {
+            from_s: now_s,
+            mechanism: mechanism.map(Arc::new),
+            start_s: now_s,
+            rates: vec![0.0; positions.len()],
+            positions,
+            displacements: learner.displacements.clone(),
+        });
+    }
+
     /// Takes in a frame as it was measured; `rest_force` is what the sensor reads untouched \[N\].
     pub fn push_frame(
         &mut self,
@@ -250,6 +265,11 @@ impl Forecaster {
             newest_s >= pending.time_s + HORIZONS[2] || now_s > pending.time_s + HORIZONS[2] + PATIENCE
         }));
         outputs
+    }
+
+    /// What is known now: the joints, the parts by themselves, the last frame. `None` without a joint.
+    pub fn knowledge(&self) -> Option<(Filter, BTreeMap<Label, FreePart>, Frame)> {
+        Some((self.filter.clone()?, self.free_parts(), self.seen.back()?.frame.clone()))
     }
 
     /// The rest, at the end of the stream.

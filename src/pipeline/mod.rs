@@ -1,10 +1,15 @@
 //! The one state machine that the node and the replay share.
 
+mod evaluate;
 mod explain;
 mod forecast;
+mod keyframes;
 mod learner;
+mod planning;
 mod poses;
 mod posterior;
+mod retention;
+mod saved;
 mod windows;
 mod worker;
 mod working_frame;
@@ -14,9 +19,12 @@ use std::sync::Arc;
 
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
+pub use evaluate::{PartScore, Scores};
 pub use explain::Frame;
 pub use learner::{Learner, ParentEvidence, WindowJob};
+pub use planning::Planner;
 pub use poses::PoseSettings;
+pub use saved::{ResumeError, SavedObject, SavedObjectRef, Snapshot};
 pub use windows::{FrameAssembler, WindowCutter, WindowSettings};
 pub use worker::{ClosedWindow, Learned, Worker};
 
@@ -24,9 +32,11 @@ use crate::math::Pose;
 use crate::model::{DynamicsLearner, KinematicSettings, PoseMeasurement};
 use crate::registration::{AlignmentSettings, Quadratic, SurfelAccumulator, align, truncated_cost};
 use crate::types::{Input, Label, Stamp};
+use evaluate::Scoring;
 use explain::{FEWEST_POINTS, measurement_of, travel};
 use forecast::Forecaster;
 use poses::{POSED_RADIUS, PoseBuffer, PosedPart, RECORD_GAP, references};
+use saved::Resumed;
 use windows::frame_of;
 use working_frame::WorkingFrame;
 
@@ -42,6 +52,8 @@ pub struct PipelineSettings {
     pub root: Option<Label>,
     /// Whether the tool's position is an observation of the part it holds.
     pub use_tool: bool,
+    /// Points of a part that are used of a frame at most; 0: all.
+    pub points_per_part: usize,
     /// When windows open and close.
     pub windows: WindowSettings,
     /// How poses that a topic measures become observations.
@@ -85,6 +97,15 @@ pub enum Output {
         /// Covariance of its centre of mass, held fixed in the part \[m²\].
         covariance_m2: Matrix3<f64>,
     },
+    /// A saved object was taken up at the stream's first frame.
+    Resumed {
+        /// Its root.
+        root: Label,
+        /// Parts that are not where the object has them, nor along their known joint.
+        unexplained: Vec<Label>,
+        /// Parts that the object did not have; they are added.
+        unknown: Vec<Label>,
+    },
     /// A window closed, for a [`Worker`] to learn; only if live.
     WindowClosed(Box<ClosedWindow>),
     /// A window was learned.
@@ -110,9 +131,21 @@ pub struct Pipeline {
     current: BTreeMap<Label, Pose>,
     recent: Vec<BTreeMap<Label, Pose>>,
     moving: bool,
-    /// Where the parts were when each window closed that was handed out and is not adopted yet.
-    handed_out: VecDeque<BTreeMap<Label, Pose>>,
+    /// Where the parts were when each window closed that was handed out and is not adopted yet, with
+    /// the window's number.
+    handed_out: VecDeque<(u64, BTreeMap<Label, Pose>)>,
+    closed_windows: u64,
     forecaster: Option<Forecaster>,
+    /// The latest stamp of a frame.
+    newest: Option<Stamp>,
+    /// Windows are scored, not learned.
+    scoring: Option<Scoring>,
+    /// A saved object that waits for the stream's first frame.
+    resumed: Option<Box<Resumed>>,
+    /// Where the stream's own time zero is on the object's clock \[s\].
+    begin_s: f64,
+    /// Frames at rest that show parts which the saved object does not have.
+    newcomers: Option<Vec<Frame>>,
 }
 
 impl Pipeline {
@@ -135,8 +168,25 @@ impl Pipeline {
             current: BTreeMap::new(),
             recent: Vec::new(),
             moving: false,
+            newest: None,
+            scoring: None,
+            resumed: None,
+            begin_s: 0.0,
+            newcomers: None,
             handed_out: VecDeque::new(),
+            closed_windows: 0,
         }
+    }
+
+    /// Time zero: the earliest stamp of a cloud, a pose or a wrench; `None` before the first cloud.
+    pub fn zero(&self) -> Option<Stamp> {
+        self.zero
+    }
+
+    /// The stamp that outputs count their times from, and what the learner's clock says then \[s\]; `None`
+    /// before the first frame.
+    pub fn stream_zero(&self) -> Option<(Stamp, f64)> {
+        self.zero.map(|zero| (zero.plus_seconds(self.begin_s), self.begin_s))
     }
 
     /// What has been learned; `None` before the first window.
@@ -185,8 +235,12 @@ impl Pipeline {
     }
 
     fn push_frame(&mut self, stamp: Stamp, clouds: &[crate::types::SegmentedCloud]) -> Vec<Output> {
-        let earlier = self.early.iter().map(Input::stamp).chain(self.poses.first());
-        let zero = *self.zero.get_or_insert_with(|| earlier.chain([stamp]).min().unwrap_or(stamp));
+        let zero = self.zero.unwrap_or_else(|| {
+            let first = self.early.iter().map(Input::stamp).chain(self.poses.first()).chain([stamp]).min();
+            self.time_zero(first.unwrap_or(stamp))
+        });
+        self.zero = Some(zero);
+        self.newest = self.newest.max(Some(stamp));
         if !clouds.is_empty() {
             self.poses.saw_clouds(stamp);
         }
@@ -196,7 +250,7 @@ impl Pipeline {
                 cutter.push_wrench(wrench);
             }
         }
-        let mut frame = frame_of(stamp.seconds_since(zero), clouds);
+        let mut frame = frame_of(stamp.seconds_since(zero), clouds, self.settings.points_per_part);
         let mut outputs = Vec::new();
         if clouds.is_empty() && self.last_frame_s.is_some_and(|last_s| frame.time_s - last_s > RECORD_GAP) {
             outputs.extend(self.end_record());
@@ -205,6 +259,7 @@ impl Pipeline {
         frame.scans.retain(|label, _| !self.poses.measures(*label));
         frame.poses = self.poses.at(stamp);
         frame.moves = self.poses.something_moves(frame.time_s, &frame.poses);
+        outputs.extend(self.take_up(&frame, zero));
         outputs.extend(self.observe(&frame));
         let moving = self.moving;
         let seen = self.forecaster.is_some().then(|| frame.clone());
@@ -219,7 +274,16 @@ impl Pipeline {
                 });
             }
         }
+        if let Some(frames) = self.newcomers.as_mut().filter(|frames| frames.len() < REFERENCE_FRAMES) {
+            frames.push(frame.clone());
+        }
         let job = self.cutter.as_mut().and_then(|c| c.push_frame(frame, moving, nearest_label));
+        if self.cutter.as_ref().is_some_and(WindowCutter::is_open)
+            && let Some(frames) = self.newcomers.take()
+            && let Some(learner) = &mut self.learner
+        {
+            Arc::make_mut(learner).add_parts(&frames);
+        }
         if self.learner.is_none() && self.cutter.as_ref().is_some_and(WindowCutter::is_open) {
             self.open_reference();
         }
@@ -263,9 +327,11 @@ impl Pipeline {
         let root = self.settings.root.or(largest).unwrap_or_else(|| unused_label(&posed));
         let mut learner = Learner::new(root, self.settings.use_tool, accumulators);
         learner.settings = self.settings.kinematics;
+        learner.kept_windows = self.settings.windows.kept;
+        learner.root_is_given = self.settings.root.is_some();
         learner.dynamics = DynamicsLearner::new(self.gravity_in_work());
         learner.calibrate(&self.reference);
-        learner.root_is_world = self.settings.root.is_none() && largest.is_none();
+        learner.world = (self.settings.root.is_none() && largest.is_none()).then_some(root);
         for (label, part) in posed {
             learner.add_posed(label, part);
         }
@@ -276,19 +342,31 @@ impl Pipeline {
     /// A window that closed is learned here, or handed out if live.
     fn close(&mut self, job: WindowJob) -> Option<Output> {
         let learner = self.learner.as_mut()?;
+        if let Some(scoring) = &mut self.scoring {
+            let learner = Arc::make_mut(learner);
+            scoring.score(learner, &job);
+            self.current.extend(learner.displacements.iter().map(|(l, d)| (*l, *d)));
+            return None;
+        }
         if self.settings.live {
-            self.handed_out.push_back(self.current.clone());
-            return Some(Output::WindowClosed(Box::new(ClosedWindow::new(job, Arc::clone(learner)))));
+            self.closed_windows += 1;
+            self.handed_out.push_back((self.closed_windows, self.current.clone()));
+            let window = ClosedWindow::new(self.closed_windows, job, Arc::clone(learner));
+            return Some(Output::WindowClosed(Box::new(window)));
         }
         Arc::make_mut(learner).learn(&job);
         self.current.extend(learner.displacements.iter().map(|(l, d)| (*l, *d)));
         Some(Output::Learned { span_s: job.span_s() })
     }
 
-    /// Takes over what a worker learned from the oldest window handed out. Parts go on from where
-    /// learning has them at the window's close, as far as they were seen to go since.
+    /// Takes over what a worker learned from a window handed out; older ones are not waited for any
+    /// more. Parts go on from where learning has them at the window's close, as far as they were seen
+    /// to go since.
     pub fn adopt(&mut self, learned: &Learned) -> Output {
-        let at_close = self.handed_out.pop_front().unwrap_or_default();
+        let mut at_close = BTreeMap::new();
+        while let Some((_, poses)) = self.handed_out.pop_front_if(|(number, _)| *number <= learned.sequence) {
+            at_close = poses;
+        }
         for (label, learned_pose) in &learned.learner.displacements {
             let since = match (at_close.get(label), self.current.get(label)) {
                 (Some(before), Some(now)) if before != now => *now * before.inverse(),

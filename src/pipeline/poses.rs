@@ -272,7 +272,7 @@ fn quadratic_at_zero(near: &[(f64, SeenPose)]) -> Option<SeenPose> {
 }
 
 /// Where a measured frame was at the reference configuration.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PosedPart {
     /// The measured frame in world.
     pub world_from_frame: Pose,

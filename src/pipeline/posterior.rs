@@ -8,13 +8,13 @@ use super::poses::POSED_RADIUS;
 use super::{Learner, ParentEvidence, Pipeline};
 use crate::geometry::{HullProperties, hull_properties};
 use crate::mechanism::JointType;
-use crate::model::{Axis, DynamicsPosterior, JointDynamics, KinematicFit, WindowInference, WindowObservations};
+use crate::model::{Axis, DynamicsPosterior, JointDynamics, KinematicFit};
 use crate::registration::PartModel;
 use crate::structure::TreeDistribution;
 use crate::types::Label;
 use crate::types::posterior::{
     Criticism, EdgePosterior, InformedBy, JointTypeProbabilities, ObjectPosterior, PartPosterior, PrismaticAxis,
-    Quantity, RevoluteAxis, WindowRecord,
+    Quantity, RevoluteAxis,
 };
 
 /// Density of furniture parts over their hull, median \[kg/m³\] and standard deviation of its log:
@@ -29,37 +29,35 @@ impl Pipeline {
         if let Some(learner) = &self.learner {
             return Some(learner.posterior());
         }
-        let mut parts = Parts::default();
-        let last = self.reference.last().into_iter().flat_map(|frame| &frame.scans);
-        for (label, scan) in last {
-            parts.surfaces.entry(*label).or_default().extend(scan.iter().map(|p| p.point_in_world));
-        }
+        let mut parts = Parts { surfaces: self.surfaces_in_work(), origins: BTreeMap::new() };
         let posed = self.reference.iter().rev().flat_map(|frame| &frame.poses);
         parts.origins = posed.map(|(label, seen)| (*label, seen.world_from_frame.translation)).collect();
         let likeliest = || parts.surfaces.iter().max_by_key(|(_, points)| points.len()).map(|(label, _)| *label);
         let root = self.settings.root.or_else(likeliest).or_else(|| parts.origins.keys().next().copied())?;
         (!parts.surfaces.is_empty() || !parts.origins.is_empty()).then(|| posterior(root, &parts, None))
     }
+
+    /// Points of each part's surface at the reference configuration, in the working frame \[m\].
+    pub(super) fn surfaces_in_work(&self) -> BTreeMap<Label, Vec<Vector3<f64>>> {
+        if let Some(learner) = &self.learner {
+            return learner.surfaces();
+        }
+        let last = self.reference.last().into_iter().flat_map(|frame| &frame.scans);
+        last.map(|(label, scan)| (*label, scan.iter().map(|p| p.point_in_world).collect())).collect()
+    }
 }
 
 impl Learner {
     /// What is believed by what was learned.
     pub(super) fn posterior(&self) -> ObjectPosterior {
-        let seen = self.models.iter().filter(|(label, _)| !self.posed.contains_key(label));
-        let surface = |model: &PartModel| model.surfels.iter().map(|s| s.point).collect();
-        let parts = Parts {
-            surfaces: seen.map(|(label, model)| (*label, surface(model))).collect(),
-            origins: self.posed.iter().map(|(label, part)| (*label, part.world_from_frame.translation)).collect(),
-        };
-        posterior(self.root_or_still(), &parts, Some(self))
+        let origins = self.posed.iter().map(|(label, part)| (*label, part.world_from_frame.translation)).collect();
+        posterior(self.root, &Parts { surfaces: self.surfaces(), origins }, Some(self))
     }
 
-    /// The root; where that is only a name for the world, a part that never moved while others did.
-    fn root_or_still(&self) -> Label {
-        if !self.root_is_world || self.evidence.is_empty() {
-            return self.root;
-        }
-        self.models.keys().copied().find(|label| !self.evidence.contains_key(label)).unwrap_or(self.root)
+    pub(super) fn surfaces(&self) -> BTreeMap<Label, Vec<Vector3<f64>>> {
+        let seen = self.models.iter().filter(|(label, _)| !self.posed.contains_key(label));
+        let surface = |model: &PartModel| model.surfels.iter().map(|s| s.point).collect();
+        seen.map(|(label, model)| (*label, surface(model))).collect()
     }
 }
 
@@ -92,7 +90,7 @@ fn posterior(root_label: Label, seen: &Parts, learner: Option<&Learner>) -> Obje
         root_label,
         parts,
         edges: edges(root_label, &labels, known),
-        windows: learner.map(window_records).unwrap_or_default(),
+        windows: learner.map(|learner| learner.records.clone()).unwrap_or_default(),
         criticism: Criticism::insufficient(),
     }
 }
@@ -128,30 +126,6 @@ fn part(label: Label, points: &[Vector3<f64>]) -> Option<PartPosterior> {
 struct Known<'a> {
     learner: &'a Learner,
     dynamics: Option<&'a DynamicsPosterior>,
-}
-
-fn window_records(learner: &Learner) -> Vec<WindowRecord> {
-    // The first windows may have had no joint to infer the dynamics of.
-    let without = learner.windows.len().saturating_sub(learner.inferences.len());
-    let inferences = std::iter::repeat_n(None, without).chain(learner.inferences.iter().map(Some));
-    learner.windows.iter().zip(inferences).map(|(window, inference)| window_record(window, inference)).collect()
-}
-
-fn window_record(window: &WindowObservations, inference: Option<&WindowInference>) -> WindowRecord {
-    let mut touched: BTreeSet<Label> = window.contacts.iter().map(|contact| contact.label).collect();
-    touched.extend(window.wrenches.iter().filter(|wrench| !wrench.tool).filter_map(|wrench| wrench.part));
-    let end = |time: Option<&f64>| time.copied().unwrap_or_default();
-    let learned = inference.filter(|inference| inference.failure.is_none());
-    WindowRecord {
-        t0_s: end(window.times_s.first()),
-        t1_s: end(window.times_s.last()),
-        labels: touched.into_iter().collect(),
-        frames: window.times_s.len(),
-        steps: inference.map_or(0, |inference| inference.steps),
-        inference_wall_s: 0.0,
-        elbo: learned.map(|inference| inference.elbo),
-        log_predictive_density: learned.map(|inference| inference.log_predictive_density),
-    }
 }
 
 fn edges(root: Label, labels: &[Label], known: Option<Known<'_>>) -> Vec<EdgePosterior> {

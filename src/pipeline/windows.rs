@@ -28,11 +28,13 @@ pub struct WindowSettings {
     pub quiet_s: f64,
     /// It closes at this length in any case \[s\].
     pub longest_s: f64,
+    /// How many windows are kept in full, the most informative ones; the others leave summaries.
+    pub kept: usize,
 }
 
 impl Default for WindowSettings {
     fn default() -> Self {
-        Self { force_threshold_n: 0.3, smoothing_s: 0.064, lead_s: 0.3, quiet_s: 0.35, longest_s: 5.0 }
+        Self { force_threshold_n: 0.3, smoothing_s: 0.064, lead_s: 0.3, quiet_s: 0.35, longest_s: 5.0, kept: 12 }
     }
 }
 
@@ -75,8 +77,8 @@ impl FrameAssembler {
     }
 }
 
-/// One frame from the clouds of a stamp.
-pub fn frame_of(time_s: f64, clouds: &[SegmentedCloud]) -> Frame {
+/// One frame from the clouds of a stamp, with at most so many points of each part, evenly picked; 0: all.
+pub fn frame_of(time_s: f64, clouds: &[SegmentedCloud], most_points: usize) -> Frame {
     let mut frame = Frame { time_s, ..Frame::default() };
     for cloud in clouds {
         for point in &cloud.points {
@@ -86,6 +88,9 @@ pub fn frame_of(time_s: f64, clouds: &[SegmentedCloud]) -> Frame {
                 .or_default()
                 .push(ScanPoint { point_in_world: point.point_in_world, viewpoint_in_world: cloud.viewpoint_in_world });
         }
+    }
+    for scan in frame.scans.values_mut().filter(|scan| most_points > 0 && scan.len() > most_points) {
+        *scan = (0..most_points).map(|k| scan[k * scan.len() / most_points]).collect();
     }
     frame
 }

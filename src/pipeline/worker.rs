@@ -2,15 +2,21 @@
 //!
 //! Replay learns in the stream, as time stands still there; a live stream does not wait.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use super::working_frame::hulls;
 use super::{Learner, WindowJob};
+use crate::geometry::HullProperties;
 use crate::math::Pose;
+use crate::types::Label;
 use crate::types::posterior::ObjectPosterior;
 
 /// A window that closed, with what a worker needs to learn it.
 #[derive(Clone)]
 pub struct ClosedWindow {
+    /// Counts the windows handed out.
+    pub(super) sequence: u64,
     job: WindowJob,
     /// What was adopted when it closed: where a worker begins that has learned nothing yet.
     learner: Arc<Learner>,
@@ -24,8 +30,8 @@ impl std::fmt::Debug for ClosedWindow {
 }
 
 impl ClosedWindow {
-    pub(super) fn new(job: WindowJob, learner: Arc<Learner>) -> Self {
-        Self { job, learner, world_from_work: Pose::identity() }
+    pub(super) fn new(sequence: u64, job: WindowJob, learner: Arc<Learner>) -> Self {
+        Self { sequence, job, learner, world_from_work: Pose::identity() }
     }
 
     pub(super) fn carried_out(self, world_from_work: &Pose) -> Self {
@@ -38,15 +44,27 @@ impl ClosedWindow {
     }
 }
 
+impl std::fmt::Debug for Learned {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Learned").field("span_s", &self.span_s).finish_non_exhaustive()
+    }
+}
+
 /// What a worker knows after a window.
 #[derive(Clone)]
 pub struct Learned {
+    /// The last window learned.
+    pub(super) sequence: u64,
     /// Everything learned so far, for [`Pipeline::adopt`](super::Pipeline::adopt).
     pub learner: Arc<Learner>,
     /// Seconds since time zero of the window's first and last frame.
     pub span_s: (f64, f64),
     /// What is believed now, in world.
     pub posterior: ObjectPosterior,
+    /// Hulls of the parts, in world at the first frame.
+    pub hulls: BTreeMap<Label, HullProperties>,
+    /// Least and greatest position of each joint of the likeliest tree so far, by child \[m or rad\].
+    pub ranges_seen: BTreeMap<Label, (f64, f64)>,
 }
 
 /// Learns windows one after the other, in the order they closed.
@@ -62,9 +80,12 @@ impl Worker {
         // The stream goes on with the one before meanwhile.
         Arc::make_mut(learner).learn(&window.job);
         Learned {
+            sequence: window.sequence,
             learner: Arc::clone(learner),
             span_s: window.span_s(),
             posterior: learner.posterior().carried_by(&window.world_from_work),
+            hulls: hulls(&learner.surfaces(), &window.world_from_work),
+            ranges_seen: learner.ranges_seen(),
         }
     }
 }

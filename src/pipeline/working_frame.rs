@@ -4,13 +4,16 @@
 //! world's frame would give another posterior. So: z up, origin and x from the first cloud, all
 //! input carried in, all output carried out. Without gravity, z is the cloud's thinnest direction.
 
+use std::collections::BTreeMap;
+
 use nalgebra::{Matrix3, Matrix6, Vector3};
 
-use super::{Output, Pipeline};
+use super::{Learner, Output, Pipeline};
+use crate::geometry::{HullProperties, hull_properties};
 use crate::math::Pose;
 use crate::model::PoseMeasurement;
 use crate::types::posterior::ObjectPosterior;
-use crate::types::{AppliedWrench, Input, LabelledPoint};
+use crate::types::{AppliedWrench, Input, Label, LabelledPoint};
 
 /// Gravity weaker than this says nothing of up \[m/s²\].
 const LEAST_GRAVITY: f64 = 1e-3;
@@ -41,13 +44,15 @@ impl Pipeline {
         let world_from_work = self.world_from_work();
         let work_from_world = world_from_work.inverse();
         let outputs = pending.into_iter().flat_map(|input| self.push_carried(carried_input(input, &work_from_world)));
-        outputs.collect::<Vec<_>>().into_iter().map(|output| carried_output(output, &world_from_work)).collect()
+        let outputs: Vec<Output> = outputs.collect();
+        outputs.into_iter().map(|output| carried_output(output, &world_from_work, self.begin_s)).collect()
     }
 
     /// Ends the stream: what is open is closed and learned.
     pub fn finish(&mut self) -> Vec<Output> {
         let world_from_work = self.world_from_work();
-        self.finish_carried().into_iter().map(|output| carried_output(output, &world_from_work)).collect()
+        let outputs = self.finish_carried();
+        outputs.into_iter().map(|output| carried_output(output, &world_from_work, self.begin_s)).collect()
     }
 
     /// What is believed now; before the first window, the prior. `None` while no part was seen.
@@ -55,16 +60,39 @@ impl Pipeline {
         Some(self.posterior_in_work()?.carried_by(&self.world_from_work()))
     }
 
+    /// Hulls of the parts as seen so far, in world at the first frame.
+    pub fn hulls(&self) -> BTreeMap<Label, HullProperties> {
+        hulls(&self.surfaces_in_work(), &self.world_from_work())
+    }
+
+    /// Least and greatest position of each joint of the likeliest tree in the windows learned, by child
+    /// \[m or rad\].
+    pub fn ranges_seen(&self) -> BTreeMap<Label, (f64, f64)> {
+        self.learner().map(Learner::ranges_seen).unwrap_or_default()
+    }
+
     pub(super) fn gravity_in_work(&self) -> Vector3<f64> {
         self.world_from_work().rotation.transpose() * self.settings.gravity_in_world
     }
 
-    fn world_from_work(&self) -> Pose {
+    pub(super) fn world_from_work(&self) -> Pose {
         match self.working_frame {
             WorkingFrame::Open(_) => Pose::identity(),
             WorkingFrame::Known(pose) => pose,
         }
     }
+}
+
+/// Hulls of surfaces, carried into world.
+pub(super) fn hulls(
+    surfaces_in_work: &BTreeMap<Label, Vec<Vector3<f64>>>,
+    world_from_work: &Pose,
+) -> BTreeMap<Label, HullProperties> {
+    let in_world = |points: &[Vector3<f64>]| -> Vec<Vector3<f64>> {
+        points.iter().map(|p| world_from_work.transform_point(p)).collect()
+    };
+    let surfaces = surfaces_in_work.iter();
+    surfaces.filter_map(|(label, points)| Some((*label, hull_properties(&in_world(points), None)?))).collect()
 }
 
 /// world_from_work by the first thing seen; wrenches say nothing of it.
@@ -125,20 +153,25 @@ fn carried_input(input: Input, work_from_world: &Pose) -> Input {
     }
 }
 
-fn carried_output(output: Output, world_from_work: &Pose) -> Output {
+/// In world, times from the stream's own zero.
+fn carried_output(output: Output, world_from_work: &Pose, begin_s: f64) -> Output {
     match output {
         Output::Observation { time_s, label, measurement } => {
             let displacement = *world_from_work * measurement.displacement * world_from_work.inverse();
             let information = turned(&measurement.information, &world_from_work.rotation);
-            Output::Observation { time_s, label, measurement: PoseMeasurement { displacement, information } }
+            Output::Observation {
+                time_s: time_s - begin_s,
+                label,
+                measurement: PoseMeasurement { displacement, information },
+            }
         }
         Output::Prediction { time_s, horizon_s, label, displacement, covariance_m2 } => {
             let displacement = *world_from_work * displacement * world_from_work.inverse();
             let covariance_m2 = world_from_work.rotation * covariance_m2 * world_from_work.rotation.transpose();
-            Output::Prediction { time_s, horizon_s, label, displacement, covariance_m2 }
+            Output::Prediction { time_s: time_s - begin_s, horizon_s, label, displacement, covariance_m2 }
         }
         Output::WindowClosed(window) => Output::WindowClosed(Box::new(window.carried_out(world_from_work))),
-        Output::Learned { span_s } => Output::Learned { span_s },
+        other => other,
     }
 }
 
@@ -153,7 +186,6 @@ fn turned(information: &Matrix6<f64>, rotation: &Matrix3<f64>) -> Matrix6<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::types::Label;
     use nalgebra::UnitQuaternion;
 
     fn points() -> Vec<LabelledPoint> {

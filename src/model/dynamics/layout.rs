@@ -7,6 +7,7 @@
 //! a mass within a factor of three times a centre within a few centimetres.
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
+use serde::{Deserialize, Serialize};
 
 use crate::geometry::HullProperties;
 use crate::inference::{Failure, Gaussian};
@@ -51,7 +52,7 @@ const LOG_FORCE_DEVIATION: f64 = 1.5;
 pub const LIMIT_DEVIATION: f64 = 0.01;
 
 /// Typical force and rate of a joint, from the first window in which it moved.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct JointScales {
     /// \[N or N·m\].
     pub force: f64,
@@ -60,7 +61,7 @@ pub struct JointScales {
 }
 
 /// All that is fixed of one joint and its body.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct JointModel {
     /// Parent, child, type, axis.
     pub joint: KinematicJoint,
@@ -193,7 +194,7 @@ impl JointModel {
 }
 
 /// The joints with their numbers one joint after the other.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Mechanism {
     /// Parents first.
     pub joints: Vec<JointModel>,

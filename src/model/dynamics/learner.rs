@@ -3,10 +3,11 @@
 use std::collections::BTreeMap;
 
 use nalgebra::{DMatrix, DVector, Vector3};
+use serde::{Deserialize, Serialize};
 
 use super::layout::{JointScales, LIMIT_DEVIATION, LOWER, Mechanism, UPPER, joint_models};
 use super::site::{FittedWindow, WindowFit, inertial_entries, load_factor};
-use super::track::{Drive, TrackKinematics, TrackSource, driven_labels, joint_track};
+use super::track::{Drive, TrackKinematics, TrackSource, driven_labels, joint_track, touched_label};
 use crate::geometry::HullProperties;
 use crate::inference::{Belief, Factor, Failure, Gaussian, Joint};
 use crate::math::orthonormal_pair;
@@ -26,7 +27,7 @@ const SHORTEST_HALT: f64 = 0.1;
 const STOP_EVIDENCE: f64 = 4.0;
 
 /// What a block of numbers is about.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum Block {
     /// Damping, friction, inertia, stops of a part's joint.
     Dynamics(Label),
@@ -36,8 +37,17 @@ pub enum Block {
     ToolOffset,
 }
 
+/// What a site stands for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub enum Site {
+    /// A window that is kept, by its index: it can be learned again.
+    Window(usize),
+    /// All windows gone by in which the tool held this part, as one Gaussian.
+    Past(Option<Label>),
+}
+
 /// What learning one window gave.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct WindowInference {
     /// Linearizations spent, on this window and on older ones.
     pub steps: usize,
@@ -55,7 +65,7 @@ pub struct WindowInference {
 }
 
 /// What stays of a joint between windows.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 struct JointMemory {
     signature: (JointType, Option<Label>, Vec<Label>),
     /// A fit that finds the axis the other way round counts positions the other way.
@@ -66,10 +76,12 @@ struct JointMemory {
     stop_positions: [f64; 2],
     center_basis: Option<[Vector3<f64>; 2]>,
     hull: Option<HullProperties>,
+    /// Least and greatest position in the windows gone by \[m or rad\].
+    reached: Option<(f64, f64)>,
 }
 
 /// What stays of a window.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 struct WindowMemory {
     contacts: Vec<Contact>,
     noise_scale: Option<f64>,
@@ -82,12 +94,14 @@ struct WindowMemory {
 }
 
 /// Learns the dynamics from windows, given the kinematic fit of all of them.
-#[derive(Clone)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct DynamicsLearner {
     gravity: Vector3<f64>,
-    pub(super) belief: Belief<Block, usize>,
+    pub(super) belief: Belief<Block, Site>,
     joints: BTreeMap<Label, JointMemory>,
     windows: Vec<WindowMemory>,
+    /// Axes and offset that the sites of windows gone by are about.
+    past: BTreeMap<Option<Label>, WindowMemory>,
     pub(super) mechanism: Mechanism,
 }
 
@@ -113,8 +127,14 @@ impl DynamicsLearner {
             belief: Belief::default(),
             joints: BTreeMap::new(),
             windows: Vec::new(),
+            past: BTreeMap::new(),
             mechanism: Mechanism { joints: Vec::new(), gravity },
         }
+    }
+
+    /// Keeps a window in which no joint is known yet: it is learned with the first that follows.
+    pub fn keep_window(&mut self, contacts: &[Contact]) {
+        self.windows.push(WindowMemory { contacts: contacts.to_vec(), ..WindowMemory::default() });
     }
 
     /// Learns the newest window, and older ones again as the budget allows.
@@ -171,6 +191,7 @@ impl DynamicsLearner {
                     stop_positions: [0.0; 2],
                     center_basis: None,
                     hull,
+                    reached: None,
                 };
                 self.joints.insert(joint.child, memory);
             }
@@ -194,10 +215,40 @@ impl DynamicsLearner {
         self.set_kinematic_prior(fit)
     }
 
+    /// Lets a window go: its site is multiplied onto those of the windows gone by that the tool held
+    /// the same part in, and is not fitted again. Later windows move up one place. `fit` is the fit that
+    /// was last learned with.
+    pub fn retire(&mut self, window: usize, fit: &KinematicFit) {
+        if window >= self.windows.len() {
+            return;
+        }
+        for (joint, path) in fit.joints.iter().zip(fit.positions.get(window).into_iter().flatten()) {
+            if let Some(memory) = self.joints.get_mut(&joint.child) {
+                let (low, high) = range(path);
+                memory.reached = Some(memory.reached.map_or((low, high), |(l, h)| (l.min(low), h.max(high))));
+            }
+        }
+        let memory = self.windows.remove(window);
+        if let Some(factor) = self.belief.remove(&Site::Window(window)) {
+            let label = touched_label(&memory.contacts);
+            self.belief.multiply(Site::Past(label), &factor);
+            let past = self.past.entry(label).or_default();
+            past.axes.extend(memory.axes);
+            past.tool_offset = memory.tool_offset;
+        }
+        self.belief.rename_sites(|site| match site {
+            Site::Window(later) if later > window => Site::Window(later - 1),
+            other => other,
+        });
+    }
+
     fn forget(&mut self, label: Label) {
         for block in [Block::Dynamics(label), Block::Axis(label)] {
-            for window in self.belief.drop_sites_of(&block) {
-                self.windows[window].learned = false;
+            for site in self.belief.drop_sites_of(&block) {
+                match site {
+                    Site::Window(window) => self.windows[window].learned = false,
+                    Site::Past(label) => drop(self.past.remove(&label)),
+                }
             }
         }
         self.belief.remove_prior(&Block::Dynamics(label));
@@ -249,9 +300,13 @@ impl DynamicsLearner {
 
     /// Carries the sites' kinematic errors over to the new fit: old = turn · new + shift.
     fn recenter(&mut self, fit: &KinematicFit) {
-        let windows = &mut self.windows;
-        for (&window, factor) in self.belief.sites_mut() {
-            let Some(memory) = windows.get_mut(window) else {
+        let (windows, past) = (&mut self.windows, &mut self.past);
+        for (site, factor) in self.belief.sites_mut() {
+            let memory = match site {
+                Site::Window(window) => windows.get_mut(*window),
+                Site::Past(label) => past.get_mut(label),
+            };
+            let Some(memory) = memory else {
                 continue;
             };
             let size = factor.gaussian.dimension();
@@ -416,7 +471,7 @@ impl DynamicsLearner {
             }
         }
         let (factor, result) = fitted;
-        self.belief.replace(window, factor);
+        self.belief.replace(Site::Window(window), factor);
         let turn = self.windows.len();
         let memory = &mut self.windows[window];
         memory.learned = true;
@@ -450,10 +505,10 @@ impl DynamicsLearner {
         // The load that stood for a tenth of the contact: not a spike of noise.
         let load = quantile(self.generalized_forces(touched, fit, &track), 0.9).ok_or(Failure::NoInformation)?;
         let block = Block::Dynamics(label);
-        let (mean, covariance) = self.belief.product(Some(&window)).moments(&[block])?;
+        let (mean, covariance) = self.belief.product(Some(&Site::Window(window))).moments(&[block])?;
         let friction = super::layout::FRICTION;
         let gaussian = load_factor(load.ln(), mean[friction], covariance[(friction, friction)].sqrt(), mean.len());
-        self.belief.replace(window, Factor { blocks: vec![(block, mean.len())], gaussian });
+        self.belief.replace(Site::Window(window), Factor { blocks: vec![(block, mean.len())], gaussian });
         self.windows[window].learned = true;
         Ok(WindowInference { steps: 1, ..WindowInference::default() })
     }
@@ -475,6 +530,7 @@ impl DynamicsLearner {
             let near = if joint.joint_type == JointType::Revolute { 0.02 } else { 0.005 };
             let all: Vec<f64> = fit.positions.iter().flat_map(|w| w[k].iter().copied()).collect();
             let (low, high) = range(&all);
+            let (low, high) = memory.reached.map_or((low, high), |(l, h)| (low.min(l), high.max(h)));
             for (side, end) in [low, high].into_iter().enumerate() {
                 if memory.stops[side] {
                     continue;
@@ -516,7 +572,7 @@ impl DynamicsLearner {
             let own = if whole { own } else { inertial_entries(&own) };
             active.extend(own.into_iter().map(|i| i + self.mechanism.offset(joint)));
         }
-        let cavity = self.belief.product(Some(&window));
+        let cavity = self.belief.product(Some(&Site::Window(window)));
         let blocks: Vec<Block> = self.mechanism.joints.iter().map(|m| Block::Dynamics(m.joint.child)).collect();
         let conditional = given_kinematics(&cavity, &blocks)?;
         let (mean, _) = conditional.moments()?;

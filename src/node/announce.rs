@@ -1,0 +1,188 @@
+//! What the stream says, as messages: posterior, predictions, criticism, and what planners draw on.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use nalgebra::Vector3;
+use tracing::warn;
+
+use super::drawing::{Drawing, Model, Scene};
+use super::health::now;
+use super::publications::{Outputs, Publication};
+use crate::geometry::HullProperties;
+use crate::io::counters::Counters;
+use crate::math::Pose;
+use crate::pipeline::{Learned, Pipeline};
+use crate::ros::{
+    self, FixedFrame, FutureWrench, LinkTree, PartPrediction, joint_states, link_transforms, predicted_transforms,
+};
+use crate::types::finite::NotFinite;
+use crate::types::posterior::{Criticism, ObjectPosterior};
+use crate::types::{Label, Stamp};
+
+/// How often the scene is drawn, if it does not change.
+const DRAW_EVERY: Duration = Duration::from_millis(400);
+
+/// Keeps what messages are made of.
+pub struct Announcer {
+    outputs: Outputs,
+    drawing: Drawing,
+    frame: FixedFrame,
+    model: Option<Arc<Model>>,
+    displacements: BTreeMap<Label, Pose>,
+    /// Joint positions, to count turns.
+    positions: BTreeMap<Label, f64>,
+    /// Whether a window was learned.
+    learned: bool,
+    tf: bool,
+    drawn: Option<Instant>,
+}
+
+impl Announcer {
+    /// Nothing is known; all is said in `fixed_frame`.
+    pub fn new(outputs: Outputs, drawing: Drawing, fixed_frame: String) -> Self {
+        Self {
+            outputs,
+            drawing,
+            frame: FixedFrame { name: fixed_frame, zero: Stamp::default() },
+            model: None,
+            displacements: BTreeMap::new(),
+            positions: BTreeMap::new(),
+            learned: false,
+            tf: false,
+            drawn: None,
+        }
+    }
+
+    /// Forgets what was said; all is said in `fixed_frame` from now on.
+    pub fn begin(&mut self, fixed_frame: &str) {
+        self.frame = FixedFrame { name: fixed_frame.to_owned(), zero: Stamp::default() };
+        (self.model, self.learned, self.drawn) = (None, false, None);
+        self.displacements.clear();
+        self.positions.clear();
+    }
+
+    /// Whether parts' frames go on /tf.
+    pub fn publish_tf(&mut self, on: bool) {
+        self.tf = on;
+    }
+
+    /// Centres of mass of all parts at the first frame \[m\].
+    pub fn centers(&self) -> BTreeMap<Label, Vector3<f64>> {
+        let parts = self.model.iter().flat_map(|model| &model.posterior.parts);
+        parts.map(|part| (part.label, part.com_in_world_m.into())).collect()
+    }
+
+    /// A part's centre of mass at the first frame \[m\].
+    pub fn center(&self, label: Label) -> Option<Vector3<f64>> {
+        let parts = &self.model.as_ref()?.posterior.parts;
+        parts.iter().find(|part| part.label == label).map(|part| part.com_in_world_m.into())
+    }
+
+    /// Where a part is.
+    pub fn observed(&mut self, label: Label, displacement: Pose) {
+        self.displacements.insert(label, displacement);
+    }
+
+    /// A frame was seen: where the joints are by now. Until something is learned, the prior goes with
+    /// the parts that are seen.
+    pub fn frame(&mut self, pipeline: &Pipeline, stamp: Stamp, counters: &Counters, shift_ns: i64) {
+        let known = self.model.as_ref().map_or(0, |model| model.posterior.parts.len());
+        if !self.learned && known < self.displacements.len() {
+            if let Some(zero) = pipeline.zero() {
+                self.frame.zero = Stamp(zero.0 - shift_ns);
+            }
+            if let Some(posterior) = pipeline.posterior() {
+                self.believe(posterior, pipeline.hulls(), BTreeMap::new(), counters, stamp);
+            }
+        }
+        let Some(model) = self.model.clone() else { return };
+        self.positions = model.tree.positions(&self.displacements, &self.positions);
+        let states = joint_states(&model.tree, &self.positions, &BTreeMap::new(), &self.frame, stamp);
+        self.outputs.send(Publication::JointStates(states));
+        if self.tf {
+            let transforms = link_transforms(&model.tree, &self.displacements, &self.frame, stamp);
+            self.outputs.send(Publication::Tf(transforms));
+        }
+        let at = now();
+        if self.drawn.is_none_or(|drawn| at.duration_since(drawn) > DRAW_EVERY) {
+            self.draw(stamp);
+        }
+    }
+
+    /// Nothing was seen nor learned yet.
+    pub fn prior(&mut self, root: Option<Label>, counters: &Counters) {
+        let nothing = ObjectPosterior {
+            root_label: root.unwrap_or_default(),
+            parts: Vec::new(),
+            edges: Vec::new(),
+            windows: Vec::new(),
+            criticism: Criticism::insufficient(),
+        };
+        self.believe(nothing, BTreeMap::new(), BTreeMap::new(), counters, Stamp::default());
+    }
+
+    /// A saved object was taken up.
+    pub fn resumed(&mut self, pipeline: &Pipeline, stamp: Stamp, counters: &Counters, shift_ns: i64) {
+        let Some(posterior) = pipeline.posterior() else { return };
+        self.learned = true;
+        self.frame.zero = Stamp(pipeline.zero().unwrap_or_default().0 - shift_ns);
+        self.believe(posterior, pipeline.hulls(), pipeline.ranges_seen(), counters, stamp);
+    }
+
+    /// A window was learned.
+    pub fn learned(&mut self, pipeline: &Pipeline, learned: &Learned, counters: &Counters, shift_ns: i64) {
+        self.learned = true;
+        let zero = pipeline.zero().unwrap_or_default();
+        self.frame.zero = Stamp(zero.0 - shift_ns);
+        let stamp = self.frame.zero.plus_seconds(learned.span_s.1);
+        let (hulls, ranges) = (learned.hulls.clone(), learned.ranges_seen.clone());
+        self.believe(learned.posterior.clone(), hulls, ranges, counters, stamp);
+    }
+
+    fn believe(
+        &mut self,
+        posterior: ObjectPosterior,
+        hulls: BTreeMap<Label, HullProperties>,
+        ranges_seen: BTreeMap<Label, (f64, f64)>,
+        counters: &Counters,
+        stamp: Stamp,
+    ) {
+        let message = ros::object_posterior(&posterior, counters, &self.frame, stamp);
+        self.say(message.map(|message| Publication::Posterior(Box::new(message))));
+        let message = ros::criticism(&posterior.criticism, posterior.windows.len(), &self.frame, stamp);
+        self.say(message.map(Publication::Criticism));
+        let tree = LinkTree::likeliest(&posterior);
+        self.model = Some(Arc::new(Model { posterior, tree, hulls, ranges_seen }));
+        self.draw(stamp);
+    }
+
+    fn draw(&mut self, stamp: Stamp) {
+        let Some(model) = &self.model else { return };
+        self.drawn = Some(now());
+        self.drawing.draw(Scene {
+            model: Arc::clone(model),
+            displacements: self.displacements.clone(),
+            frame: self.frame.clone(),
+            stamp,
+        });
+    }
+
+    /// Where parts will be, for the cloud that came at `arrived`.
+    pub fn predicted(&self, stamp: Stamp, predictions: &[PartPrediction], arrived: Option<Instant>) {
+        let message = ros::predicted_part_poses(predictions, FutureWrench::Held, &self.frame, stamp);
+        self.say(message.map(|message| Publication::Predicted(message, arrived)));
+        if let Some(model) = self.model.as_ref().filter(|_| self.tf) {
+            let transforms = predicted_transforms(&model.tree, predictions, &self.frame, stamp);
+            self.outputs.send(Publication::Tf(transforms));
+        }
+    }
+
+    fn say(&self, publication: Result<Publication, NotFinite>) {
+        match publication {
+            Ok(publication) => self.outputs.send(publication),
+            Err(error) => warn!("not sent: {error}"),
+        }
+    }
+}
