@@ -9,7 +9,7 @@ use anyhow::{Context, bail};
 use bayesian_object_models::{
     io::{
         bag::Bag,
-        config::{Config, InputConfig},
+        config::{Config, Engine, InputConfig},
         counters::Counters,
         document::PosteriorDocument,
         ingest::Ingest,
@@ -50,6 +50,9 @@ pub struct ReplayArguments {
     /// Write where each part was expected, csv
     #[arg(long, value_name = "OUT.csv")]
     predictions: Option<PathBuf>,
+    /// What the published dynamics come from, in place of the configuration's
+    #[arg(long, value_enum)]
+    engine: Option<Engine>,
     /// Seed of all random numbers, in place of the configuration's
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
@@ -75,6 +78,7 @@ pub fn run(arguments: &ReplayArguments) -> anyhow::Result<()> {
         None => Config::default(),
     };
     config.seed = arguments.seed.unwrap_or(config.seed);
+    config.engine = arguments.engine.unwrap_or(config.engine);
     let mut bag = Bag::open(&arguments.bag)?;
     let missing = MissingTopics::of(&config.input, bag.summary());
     if let Some(missing) = missing.as_ref().filter(|missing| missing.nothing_to_see) {

@@ -7,10 +7,12 @@ use std::{
     path::{Path, PathBuf},
 };
 
+use clap::ValueEnum;
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 use thiserror::Error;
 
 use crate::{
+    inference::{Sampler, SamplingSettings},
     model::KinematicSettings,
     pipeline::{PipelineSettings, PoseSettings, WindowSettings},
     types::Label,
@@ -45,6 +47,10 @@ pub enum ConfigError {
 pub struct Config {
     /// Seed of all random numbers.
     pub seed: u64,
+    /// What the published dynamics come from.
+    pub engine: Engine,
+    /// How long HMC and NUTS sample.
+    pub sampling: SamplingConfig,
     /// Gravity in world \[m/s²\].
     pub gravity_m_s2: [f64; 3],
     /// Topics, frames and what to make of them.
@@ -67,6 +73,8 @@ impl Default for Config {
     fn default() -> Self {
         Self {
             seed: 0,
+            engine: Engine::Svi,
+            sampling: SamplingConfig::default(),
             gravity_m_s2: [0.0, 0.0, -9.81],
             input: InputConfig::default(),
             posterior_latency_s: 0.0,
@@ -90,10 +98,21 @@ impl Config {
             poses: self.poses,
             kinematics: self.kinematics,
             gravity_in_world: self.gravity_m_s2.into(),
+            sampling: self.sampling(),
             predict: false,
             posterior_latency_s: self.posterior_latency_s,
             live: false,
         }
+    }
+
+    fn sampling(&self) -> Option<SamplingSettings> {
+        let sampler = match self.engine {
+            Engine::Svi => return None,
+            Engine::Hmc => Sampler::Hmc,
+            Engine::Nuts => Sampler::Nuts,
+        };
+        let SamplingConfig { chains, warmup, draws, leapfrog_steps } = self.sampling;
+        Some(SamplingSettings { sampler, chains, warmup, draws, seed: self.seed, leapfrog_steps })
     }
 
     /// Reads a file.
@@ -154,7 +173,51 @@ impl Config {
                 return Err((key.into(), format!("{value}, expected 0 to 1e6")));
             }
         }
+        let SamplingConfig { chains, warmup, draws, leapfrog_steps } = self.sampling;
+        for (key, value, least) in [
+            ("sampling.chains", chains, 1),
+            ("sampling.warmup", warmup, 1),
+            ("sampling.draws", draws, 10),
+            ("sampling.leapfrog_steps", leapfrog_steps, 1),
+        ] {
+            if !(least..=1_000_000).contains(&value) {
+                return Err((key.into(), format!("{value}, expected {least} to 1000000")));
+            }
+        }
         self.input.check()
+    }
+}
+
+/// What the published dynamics come from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Engine {
+    /// Gaussian factors by natural gradients
+    #[default]
+    Svi,
+    /// Hamiltonian Monte Carlo
+    Hmc,
+    /// The no-U-turn sampler
+    Nuts,
+}
+
+/// How long HMC and NUTS sample.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SamplingConfig {
+    /// Chains, side by side.
+    pub chains: usize,
+    /// Draws per chain that tune the step and are thrown away.
+    pub warmup: usize,
+    /// Draws per chain that are kept.
+    pub draws: usize,
+    /// Evaluations of the density per draw at most.
+    pub leapfrog_steps: usize,
+}
+
+impl Default for SamplingConfig {
+    fn default() -> Self {
+        Self { chains: 2, warmup: 60, draws: 200, leapfrog_steps: 15 }
     }
 }
 

@@ -5,7 +5,9 @@ mod edges;
 mod kinematics;
 mod window;
 
-pub use dynamics::{DynamicsInput, DynamicsLearner, DynamicsPosterior, JointDynamics, PartDynamics, WindowInference};
+pub use dynamics::{
+    DynamicsInput, DynamicsLearner, DynamicsPosterior, JointDynamics, PartDynamics, SamplingReport, WindowInference,
+};
 pub use edges::{
     EdgeFit, EdgePart, axes_from_motion, moving_evidence, nearest_position, relative_windows, rigid_evidence,
 };

@@ -132,7 +132,12 @@ fn input_values(health: &Health) -> Vec<KeyValue> {
 
 fn tracking_values(health: &Health) -> Vec<KeyValue> {
     let mut values = Vec::new();
-    for (name, times) in [("cloud to prediction sent", &health.latency), ("tracking of a cloud", &health.tracking)] {
+    let all = [
+        ("cloud to prediction sent", &health.latency),
+        ("tracking of a cloud", &health.tracking),
+        ("tracking of a cloud on the processor", &health.processor),
+    ];
+    for (name, times) in all {
         let [median, most, longest] = times.quantiles([0.5, 0.99, 1.0]);
         values.push(value(format!("{name}, p50 [ms]"), milliseconds(median)));
         values.push(value(format!("{name}, p99 [ms]"), milliseconds(most)));

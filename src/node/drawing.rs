@@ -9,6 +9,7 @@ use anyhow::Context as _;
 use ros2_interfaces_jazzy_serde::std_msgs::msg::String as Text;
 use tracing::warn;
 
+use super::learning::give_way;
 use super::publications::{Outputs, Publication};
 use crate::geometry::HullProperties;
 use crate::io::output_file::OutputFile;
@@ -70,6 +71,7 @@ impl Drawing {
 }
 
 fn draw_all(scenes: &Receiver<Scene>, outputs: &Outputs, meshes: Option<&Path>) {
+    give_way();
     let mut described: Option<Arc<Model>> = None;
     while let Ok(first) = scenes.recv() {
         let scene = scenes.try_iter().last().unwrap_or(first);

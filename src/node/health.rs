@@ -118,6 +118,8 @@ pub struct Health {
     pub latency: Times,
     /// From taking a cloud to its predictions being ready \[s\].
     pub tracking: Times,
+    /// Of that, on the processor \[s\].
+    pub processor: Times,
     /// Learning.
     pub inference: Inference,
     /// Publishers and subscribers whose QoS does not fit, by topic.
@@ -155,6 +157,7 @@ impl SharedHealth {
             no_tf: BTreeMap::new(),
             latency: Times::default(),
             tracking: Times::default(),
+            processor: Times::default(),
             inference: Inference::default(),
             incompatible: BTreeMap::new(),
             parameters,
@@ -178,6 +181,12 @@ impl SharedHealth {
 #[allow(clippy::disallowed_methods)]
 pub fn now() -> Instant {
     Instant::now()
+}
+
+/// Time that this thread has had on a processor \[s\]; `None` where the system does not tell.
+pub fn processor_s() -> Option<f64> {
+    let schedule = std::fs::read_to_string("/proc/thread-self/schedstat").ok()?;
+    Some(schedule.split_whitespace().next()?.parse::<f64>().ok()? * 1e-9)
 }
 
 impl Health {

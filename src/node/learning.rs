@@ -10,9 +10,9 @@ use super::health::{SharedHealth, now};
 use crate::pipeline::{ClosedWindow, Learned, Worker};
 
 /// Windows that wait at most; one more, and the oldest that waits is dropped and counted.
-const MOST_WAITING: usize = 8;
-/// How much inference gives way to the stream where they share a core, in nice's steps.
-const NICENESS: i32 = 10;
+const MOST_WAITING: usize = 4;
+/// How much tracking goes before other programs and inference after them, in nice's steps.
+const NICENESS: (i32, i32) = (-10, 10);
 
 /// A window, and which life of the pipeline it is from.
 struct Job {
@@ -131,8 +131,12 @@ impl Learning {
     }
 }
 
-/// Lets the stream go first. On a system that refuses it, both have the same right.
-fn give_way() {
-    let thread = rustix::thread::gettid();
-    let _ = rustix::process::setpriority_process(Some(thread), NICENESS);
+/// Threads begun by this one from now on go first. Few systems permit it to all: then nothing changes.
+pub fn go_first() {
+    let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS.0);
+}
+
+/// Lets the stream go first.
+pub fn give_way() {
+    let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS.1);
 }

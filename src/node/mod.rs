@@ -63,6 +63,7 @@ pub fn run(arguments: &RosArguments) -> anyhow::Result<()> {
     let names = Names::new(NAME, arguments)?;
     let mut parameters = Parameters::declared();
     let unusable = parameters.start_with(&arguments.overrides, &names);
+    learning::go_first();
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().context("tokio")?;
     runtime.block_on(live(&names, parameters, unusable, !arguments.rosout_disabled))

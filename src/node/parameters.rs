@@ -450,6 +450,12 @@ mod tests {
     }
 
     #[test]
+    fn the_list_of_all_fits_into_a_datagram() {
+        let bytes: usize = Parameters::declared().names().map(|name| name.len() + 8).sum();
+        assert!(bytes < 1200, "{bytes} bytes: see `quality_declaration`");
+    }
+
+    #[test]
     fn every_parameter_is_described() {
         let parameters = Parameters::declared();
         for name in parameters.names() {

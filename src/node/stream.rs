@@ -12,7 +12,7 @@ use tracing::{info, warn};
 
 use super::announce::Announcer;
 use super::drawing::Drawing;
-use super::health::{SharedHealth, now};
+use super::health::{SharedHealth, now, processor_s};
 use super::inbox::{Arrival, Inbox};
 use super::learning::Learning;
 use super::publications::Outputs;
@@ -271,8 +271,8 @@ impl Stream {
                 self.shift_ns = newest.plus_seconds(JUMP_S).0 - first.0;
             }
         }
-        let begin = now();
         let is_cloud = matches!(arrival.message, Message::Cloud(_));
+        let (begin, begin_on_processor) = (now(), is_cloud.then(processor_s).flatten());
         let inputs = self.ingest.push_message(&arrival.topic, arrival.message);
         let mut outputs = Vec::new();
         if let Some(pipeline) = self.pipeline.as_mut().filter(|_| self.active) {
@@ -286,7 +286,11 @@ impl Stream {
             self.tell(outputs);
         }
         if is_cloud {
-            self.health.lock().tracking.add(begin.elapsed().as_secs_f64());
+            let took_s = begin.elapsed().as_secs_f64();
+            let on_processor_s = processor_s().zip(begin_on_processor).map(|(end, begin)| end - begin);
+            let mut health = self.health.lock();
+            health.tracking.add(took_s);
+            on_processor_s.into_iter().for_each(|time_s| health.processor.add(time_s));
         }
     }
 

@@ -10,13 +10,14 @@ use super::explain::{Baseline, Frame, Motion, Scene, explain_window, measure_fac
 use super::keyframes::Keyframes;
 use super::poses::{POSED_RADIUS, PosedPart, measured_motion};
 use crate::geometry::{HullProperties, hull_properties};
+use crate::inference::SamplingSettings;
 use crate::math::Pose;
 use crate::mechanism::JointType;
 use crate::model::{
     Axis, Contact, EdgeFit, EdgePart, KinematicFit, KinematicJoint, KinematicSettings, PoseMeasurement,
     WindowObservations, axes_from_motion, fit_kinematics, moving_evidence, relative_windows, rigid_evidence,
 };
-use crate::model::{DynamicsInput, DynamicsLearner, WindowInference};
+use crate::model::{DynamicsInput, DynamicsLearner, DynamicsPosterior, WindowInference};
 use crate::registration::{
     AlignmentSettings, PartModel, ScanPoint, Surfel, SurfelAccumulator, fit_circle, fit_line, truncated_cost,
 };
@@ -93,6 +94,12 @@ impl ParentEvidence {
 pub struct Learner {
     /// The part fixed to the world.
     pub root: Label,
+    /// How the published dynamics are sampled; `None`: they are SVI's own.
+    #[serde(skip)]
+    pub sampling: Option<SamplingSettings>,
+    /// Time zero of the windows, once there is one.
+    #[serde(skip)]
+    zero: Option<crate::types::Stamp>,
     /// Whether it was given: else it is what the evidence says, and may change.
     pub root_is_given: bool,
     /// A name for the world, for when it is none of the parts.
@@ -150,6 +157,8 @@ impl Learner {
         let models = reference.iter().filter_map(|(label, s)| Some((*label, PartModel::new(s, &[])?))).collect();
         Self {
             root,
+            sampling: None,
+            zero: None,
             root_is_given: true,
             world: None,
             use_tool,
@@ -330,6 +339,7 @@ impl Learner {
             self.dynamics.keep_window(&job.contacts);
             return;
         };
+        self.zero = Some(job.zero);
         let windows: Vec<&WindowObservations> = self.windows.iter().collect();
         let input = DynamicsInput {
             windows: &windows,
@@ -339,6 +349,26 @@ impl Learner {
             use_tool: self.use_tool,
         };
         self.inferences.push(self.dynamics.learn_window(fit, &input));
+    }
+
+    /// The dynamics as they are published: by the engine that was asked for.
+    pub(super) fn published_dynamics(&self) -> Option<DynamicsPosterior> {
+        let (Some(settings), Some(fit), Some(zero)) = (&self.sampling, &self.fit, self.zero) else {
+            return self.dynamics.posterior().ok();
+        };
+        let windows: Vec<&WindowObservations> = self.windows.iter().collect();
+        let input =
+            DynamicsInput { windows: &windows, contacts: &[], zero, parts: &self.hulls, use_tool: self.use_tool };
+        match self.dynamics.sampled_posterior(fit, &input, settings) {
+            Ok((posterior, report)) => {
+                tracing::info!(?report, "dynamics sampled");
+                Some(posterior)
+            }
+            Err(failure) => {
+                tracing::warn!(%failure, "dynamics could not be sampled, SVI's stand");
+                self.dynamics.posterior().ok()
+            }
+        }
     }
 
     /// Measures a part's poses in the last window, about its track.

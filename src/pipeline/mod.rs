@@ -28,6 +28,7 @@ pub use saved::{ResumeError, SavedObject, SavedObjectRef, Snapshot};
 pub use windows::{FrameAssembler, WindowCutter, WindowSettings};
 pub use worker::{ClosedWindow, Learned, Worker};
 
+use crate::inference::SamplingSettings;
 use crate::math::Pose;
 use crate::model::{DynamicsLearner, KinematicSettings, PoseMeasurement};
 use crate::registration::{AlignmentSettings, Quadratic, SurfelAccumulator, align, truncated_cost};
@@ -62,6 +63,8 @@ pub struct PipelineSettings {
     pub kinematics: KinematicSettings,
     /// Gravity in world \[m/s²\].
     pub gravity_in_world: Vector3<f64>,
+    /// How the published dynamics are sampled; `None`: they are SVI's own.
+    pub sampling: Option<SamplingSettings>,
     /// Whether to predict.
     pub predict: bool,
     /// For prediction, a posterior counts from its window's close plus this \[s\].
@@ -327,6 +330,7 @@ impl Pipeline {
         let root = self.settings.root.or(largest).unwrap_or_else(|| unused_label(&posed));
         let mut learner = Learner::new(root, self.settings.use_tool, accumulators);
         learner.settings = self.settings.kinematics;
+        learner.sampling = self.settings.sampling;
         learner.kept_windows = self.settings.windows.kept;
         learner.root_is_given = self.settings.root.is_some();
         learner.dynamics = DynamicsLearner::new(self.gravity_in_work());

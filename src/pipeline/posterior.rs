@@ -77,7 +77,7 @@ fn posterior(root_label: Label, seen: &Parts, learner: Option<&Learner>) -> Obje
         seen.surfaces.iter().filter_map(|(label, points)| part(*label, points)).collect();
     parts.extend(seen.origins.iter().map(|(label, origin)| posed_part(*label, origin)));
     parts.sort_by_key(|part| part.label);
-    let dynamics = learner.and_then(|learner| learner.dynamics.posterior().ok());
+    let dynamics = learner.and_then(Learner::published_dynamics);
     for learned in dynamics.iter().flat_map(|dynamics| &dynamics.parts) {
         if let Some(part) = parts.iter_mut().find(|part| part.label == learned.label) {
             part.com_in_world_m = learned.com_in_world.into();

@@ -148,6 +148,7 @@ impl Pipeline {
         learner.settings = settings.kinematics;
         learner.use_tool = settings.use_tool;
         learner.kept_windows = settings.windows.kept;
+        learner.sampling = settings.sampling;
         learner.root_is_given |= settings.root.is_some();
         // The new stream begins at the next full second but one.
         let offset_ns = ((newest.0 - zero.0) / SECOND_NS + 2) * SECOND_NS;

@@ -205,6 +205,23 @@ impl Quantity {
         }
     }
 
+    /// Of draws in `unit`; all zero of none.
+    pub fn from_samples(unit: &str, mut draws: Vec<f64>, informed_by: InformedBy) -> Self {
+        draws.sort_by(f64::total_cmp);
+        let count = draws.len().max(1) as f64;
+        let mean = draws.iter().sum::<f64>() / count;
+        let std = (draws.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / (count - 1.0).max(1.0)).sqrt();
+        // Between the two nearest draws.
+        let quantile = |share: f64| {
+            let place = share * (count - 1.0);
+            let below = draws.get(place as usize).copied().unwrap_or(0.0);
+            let above = draws.get(place.ceil() as usize).copied().unwrap_or(below);
+            below + (above - below) * place.fract()
+        };
+        let (median, q05, q95) = (quantile(0.5), quantile(0.05), quantile(0.95));
+        Self { unit: unit.to_owned(), median, mean, std, q05, q95, informed_by }
+    }
+
     /// x ~ N(mean, std²), x in `unit`.
     pub fn from_normal(unit: &str, mean: f64, std: f64, informed_by: InformedBy) -> Self {
         Self {
@@ -328,6 +345,14 @@ mod tests {
         near((q.q95 / q.q05).ln(), Z_95);
         let certain = Quantity::from_log_normal("N", 0.0, 0.0, InformedBy::Prior);
         assert_eq!((certain.mean, certain.std, certain.q05), (1.0, 0.0, 1.0));
+    }
+
+    #[test]
+    fn samples_have_their_quantiles() {
+        let q = Quantity::from_samples("N", (0..=100).rev().map(f64::from).collect(), InformedBy::Dynamics);
+        assert_eq!((q.median, q.mean, q.q05, q.q95), (50.0, 50.0, 5.0, 95.0));
+        assert!((q.std - 29.300_170_647_967_224).abs() < 1e-12);
+        assert_eq!(Quantity::from_samples("N", Vec::new(), InformedBy::Prior).q95, 0.0);
     }
 
     #[test]

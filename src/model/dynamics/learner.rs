@@ -82,13 +82,13 @@ struct JointMemory {
 
 /// What stays of a window.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
-struct WindowMemory {
-    contacts: Vec<Contact>,
-    noise_scale: Option<f64>,
+pub(super) struct WindowMemory {
+    pub(super) contacts: Vec<Contact>,
+    pub(super) noise_scale: Option<f64>,
     /// Joints and kinematics that the site was made with.
     axes: BTreeMap<Label, Axis>,
     tool_offset: Vector3<f64>,
-    learned: bool,
+    pub(super) learned: bool,
     /// When it was last learned, in windows.
     turn: usize,
 }
@@ -99,7 +99,7 @@ pub struct DynamicsLearner {
     gravity: Vector3<f64>,
     pub(super) belief: Belief<Block, Site>,
     joints: BTreeMap<Label, JointMemory>,
-    windows: Vec<WindowMemory>,
+    pub(super) windows: Vec<WindowMemory>,
     /// Axes and offset that the sites of windows gone by are about.
     past: BTreeMap<Option<Label>, WindowMemory>,
     pub(super) mechanism: Mechanism,
@@ -351,7 +351,12 @@ impl DynamicsLearner {
 
     /// Which joints move in a window, and where the others rest.
     /// Joints in branches that no wrench acts on are left out: nothing known drives them.
-    fn moving(&self, window: usize, fit: &KinematicFit, input: &DynamicsInput<'_>) -> (Vec<usize>, Vec<Option<f64>>) {
+    pub(super) fn moving(
+        &self,
+        window: usize,
+        fit: &KinematicFit,
+        input: &DynamicsInput<'_>,
+    ) -> (Vec<usize>, Vec<Option<f64>>) {
         let root = |mut k: usize| {
             while let Some(p) = fit.joints[k].parent {
                 k = p;
@@ -562,46 +567,62 @@ impl DynamicsLearner {
         frozen: &[Option<f64>],
         (steps, warm): (usize, Option<&FittedWindow>),
     ) -> Result<(Factor<Block>, FittedWindow), Failure> {
-        let source = self.source(window, moving, fit, input);
-        let kinematics = kinematics_of(fit);
-        let track = joint_track(&source, &kinematics).ok_or(Failure::NoInformation)?;
         let involved = self.involved(fit, moving);
-        let mut active = Vec::new();
-        for &(joint, whole) in &involved {
-            let own = self.mechanism.joints[joint].active();
-            let own = if whole { own } else { inertial_entries(&own) };
-            active.extend(own.into_iter().map(|i| i + self.mechanism.offset(joint)));
-        }
         let cavity = self.belief.product(Some(&Site::Window(window)));
-        let blocks: Vec<Block> = self.mechanism.joints.iter().map(|m| Block::Dynamics(m.joint.child)).collect();
-        let conditional = given_kinematics(&cavity, &blocks)?;
-        let (mean, _) = conditional.moments()?;
-        let prior = conditional.marginal(&active)?;
+        let conditional = given_kinematics(&cavity, &self.blocks())?;
+        let window_fit = self.prepare(window, fit, input, (moving, frozen), &conditional)?;
+        let active = &window_fit.active;
+        let prior = conditional.marginal(active)?;
         let (start, covariance) = prior.moments()?;
         let starts = match warm {
             Some(warm) => vec![DVector::from_fn(active.len(), |i, _| {
                 warm.active.iter().position(|a| *a == active[i]).map_or(start[i], |k| warm.solution.point[k])
             })],
-            None => starts(&start, &covariance, &active, &self.mechanism, moving),
+            None => starts(&start, &covariance, active, &self.mechanism, moving),
         };
         let noise_scale = warm.map(|w| w.noise_scale).or(self.windows[window].noise_scale);
-        let window_fit = WindowFit {
-            mechanism: &self.mechanism,
-            source,
-            kinematics,
-            frozen: frozen.to_vec(),
-            track,
-            active,
-            base: mean.iter().copied().collect(),
-        };
         let fitted = window_fit.fit(&prior, &starts, noise_scale, steps)?;
         let deviations = self.deviations(fit, &involved, input.use_tool || !self.windows[window].contacts.is_empty());
         let sensitivity = window_fit.sensitivity(&fitted, &deviations);
         Ok((self.factor(fit, &window_fit, &fitted, &sensitivity), fitted))
     }
 
+    /// A window as it is fitted, from the mean of `conditional`: all dynamic numbers given the kinematics.
+    pub(super) fn prepare<'a>(
+        &'a self,
+        window: usize,
+        fit: &'a KinematicFit,
+        input: &'a DynamicsInput<'_>,
+        (moving, frozen): (&'a [usize], &[Option<f64>]),
+        conditional: &Gaussian,
+    ) -> Result<WindowFit<'a>, Failure> {
+        let source = self.source(window, moving, fit, input);
+        let kinematics = kinematics_of(fit);
+        let track = joint_track(&source, &kinematics).ok_or(Failure::NoInformation)?;
+        let mut active = Vec::new();
+        for (joint, whole) in self.involved(fit, moving) {
+            let own = self.mechanism.joints[joint].active();
+            let own = if whole { own } else { inertial_entries(&own) };
+            active.extend(own.into_iter().map(|i| i + self.mechanism.offset(joint)));
+        }
+        Ok(WindowFit {
+            mechanism: &self.mechanism,
+            source,
+            kinematics,
+            frozen: frozen.to_vec(),
+            track,
+            active,
+            base: conditional.moments()?.0.iter().copied().collect(),
+        })
+    }
+
+    /// The blocks of all dynamic numbers, in the order of the mechanism's layout.
+    pub(super) fn blocks(&self) -> Vec<Block> {
+        self.mechanism.joints.iter().map(|m| Block::Dynamics(m.joint.child)).collect()
+    }
+
     /// Moving joints (all their numbers count), and resting ones that they carry (inertia counts).
-    fn involved(&self, fit: &KinematicFit, moving: &[usize]) -> Vec<(usize, bool)> {
+    pub(super) fn involved(&self, fit: &KinematicFit, moving: &[usize]) -> Vec<(usize, bool)> {
         (0..fit.joints.len())
             .filter_map(|k| {
                 if moving.contains(&k) {
@@ -620,7 +641,7 @@ impl DynamicsLearner {
     }
 
     /// Standard deviations of the kinematic numbers that matter to a window; zero for the others.
-    fn deviations(&self, fit: &KinematicFit, involved: &[(usize, bool)], touched: bool) -> Vec<f64> {
+    pub(super) fn deviations(&self, fit: &KinematicFit, involved: &[(usize, bool)], touched: bool) -> Vec<f64> {
         let covariance = kinematic_covariance(fit);
         let mut deviations = vec![0.0; covariance.nrows()];
         for &(joint, whole) in involved {
@@ -719,7 +740,7 @@ fn starts(
 }
 
 /// Distribution of the dynamic numbers for the kinematics as fitted.
-fn given_kinematics(joint: &Joint<Block>, blocks: &[Block]) -> Result<Gaussian, Failure> {
+pub(super) fn given_kinematics(joint: &Joint<Block>, blocks: &[Block]) -> Result<Gaussian, Failure> {
     let places: Vec<usize> = blocks.iter().flat_map(|b| joint.places(b)).collect();
     let n = places.len();
     let gaussian = Gaussian {

@@ -8,6 +8,7 @@ mod innovations;
 mod layout;
 mod learner;
 mod posterior;
+mod sampling;
 mod site;
 #[cfg(test)]
 mod tests;
@@ -15,3 +16,4 @@ mod track;
 
 pub use learner::{DynamicsInput, DynamicsLearner, WindowInference};
 pub use posterior::{DynamicsPosterior, JointDynamics, PartDynamics};
+pub use sampling::SamplingReport;

@@ -12,7 +12,7 @@ use crate::types::posterior::{InformedBy, Quantity};
 /// Relative error that a model of rigid parts, one viscous and one Coulomb term keeps however long it
 /// is watched: on the generator's well-excited doors inertias were off by .7 % to 1.2 % with stated
 /// spreads a third of that.
-const MODEL_FLOOR: f64 = 0.012;
+pub(super) const MODEL_FLOOR: f64 = 0.012;
 
 /// Of one joint.
 #[derive(Clone, Debug, PartialEq)]

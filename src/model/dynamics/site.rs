@@ -97,7 +97,8 @@ impl LeastSquares for Problem<'_> {
 }
 
 impl WindowFit<'_> {
-    fn model(&self, noise_scale: f64) -> WindowModel<'_> {
+    /// The model of the window at a process noise.
+    pub fn model(&self, noise_scale: f64) -> WindowModel<'_> {
         WindowModel {
             mechanism: self.mechanism,
             axes: &self.kinematics.axes,
