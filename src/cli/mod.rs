@@ -1,6 +1,7 @@
 //! Subcommands, their options, logging.
 
 mod evaluate;
+mod import;
 mod node;
 mod progress;
 mod recording;
@@ -34,6 +35,7 @@ pub struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Command {
     Replay(replay::ReplayArguments),
+    Import(import::ImportArguments),
     Evaluate(evaluate::EvaluateArguments),
     Node(node::NodeArguments),
 }
@@ -51,6 +53,10 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
             let level = ros.log_level.as_deref().map(|level| if level == "fatal" { "error" } else { level });
             start_logging(level.or(arguments.log_level.as_deref()), NODE_LOG)?;
             node::run(&ros)
+        }
+        Command::Import(import) => {
+            start_logging(arguments.log_level.as_deref(), DEFAULT_LOG)?;
+            import::run(import)
         }
         Command::Evaluate(evaluate) => {
             start_logging(arguments.log_level.as_deref(), DEFAULT_LOG)?;

@@ -330,10 +330,11 @@ impl Replay {
         let bag_name = arguments.bag.display();
         let counters = self.ingest.counters().clone().with_damage(bag.damage());
         let Some(mut posterior) = self.pipeline.posterior() else {
-            bail!("{bag_name}: no cloud could be used: {}", why_nothing(&counters, &self.ingest));
+            bail!("{bag_name}: no cloud and no pose could be used: {}", why_nothing(&counters, &self.ingest));
         };
         if let Some(root) = arguments.root_label.map(Label)
             && !self.seen.contains(&root)
+            && counters.poses_in == 0
         {
             let seen: Vec<String> = self.seen.iter().map(Label::to_string).collect();
             bail!("{bag_name}: --root-label {root}: no such part, seen were {}", seen.join(", "));
@@ -366,8 +367,9 @@ pub fn bag_hash(path: &Path, config: &InputConfig) -> anyhow::Result<String> {
 }
 
 fn why_nothing(counters: &Counters, ingest: &Ingest) -> String {
+    let arrived = counters.clouds_in + counters.poses_in;
     match ingest.diagnostics().first() {
-        Some(first) => format!("{} arrived, the first dropped: {first}", counters.clouds_in),
-        None => format!("{} arrived", counters.clouds_in),
+        Some(first) => format!("{arrived} arrived, the first dropped: {first}"),
+        None => format!("{arrived} arrived"),
     }
 }

@@ -29,6 +29,27 @@ pub struct HullProperties {
     pub triangles: Vec<[u32; 3]>,
 }
 
+impl HullProperties {
+    /// A ball about a place, for a part whose surface nobody saw: its mass and its centre may be anywhere
+    /// about that.
+    pub fn guess(center: Vector3<f64>, radius: f64) -> Self {
+        let volume = 4.0 / 3.0 * std::f64::consts::PI * radius.powi(3);
+        Self {
+            volume,
+            center,
+            inertia_per_density: Matrix3::identity() * (0.4 * volume * radius * radius),
+            spread: Vector3::repeat(radius / 5f64.sqrt()),
+            vertices: Vec::new(),
+            triangles: Vec::new(),
+        }
+    }
+
+    /// Whether it was guessed.
+    pub fn is_guess(&self) -> bool {
+        self.vertices.is_empty()
+    }
+}
+
 /// The mass properties of the convex hull of `points` \[m\].
 ///
 /// A flat cloud is given the thickness of a plate, away from `viewpoint` where one is known (the

@@ -14,7 +14,7 @@ use thiserror::Error;
 use crate::{
     inference::{Sampler, SamplingSettings},
     model::KinematicSettings,
-    pipeline::{PipelineSettings, WindowSettings},
+    pipeline::{PipelineSettings, PoseSettings, WindowSettings},
     types::Label,
 };
 
@@ -61,6 +61,8 @@ pub struct Config {
     pub evaluation_horizon_s: f64,
     /// When interaction windows open and close.
     pub windows: WindowSettings,
+    /// How poses that a topic measures become observations.
+    pub poses: PoseSettings,
     /// What counts as an observation.
     pub observations: ObservationConfig,
     /// What is assumed of pose measurements.
@@ -78,6 +80,7 @@ impl Default for Config {
             posterior_latency_s: 0.0,
             evaluation_horizon_s: 1.0,
             windows: WindowSettings::default(),
+            poses: PoseSettings::default(),
             observations: ObservationConfig::default(),
             kinematics: KinematicSettings::default(),
         }
@@ -92,6 +95,7 @@ impl Config {
             use_tool: self.observations.tool_pose,
             points_per_part: self.input.points_per_part,
             windows: self.windows,
+            poses: self.poses,
             kinematics: self.kinematics,
             gravity_in_world: self.gravity_m_s2.into(),
             sampling: self.sampling(),
@@ -153,6 +157,7 @@ impl Config {
             ("evaluation_horizon_s", self.evaluation_horizon_s),
             ("windows.quiet_s", self.windows.quiet_s),
             ("windows.longest_s", self.windows.longest_s),
+            ("poses.rate_hz", self.poses.rate_hz),
             ("kinematics.tool_offset_sigma", self.kinematics.tool_offset_sigma),
             ("kinematics.shared_error", self.kinematics.shared_error),
             ("kinematics.shared_distance", self.kinematics.shared_distance),
@@ -255,8 +260,11 @@ pub struct InputConfig {
     pub clouds: Vec<String>,
     /// Topics of part poses, geometry_msgs/PoseWithCovarianceStamped; `{label}` is the part.
     pub poses: String,
-    /// Topics of wrenches, geometry_msgs/WrenchStamped.
+    /// Topics of wrenches that tools apply, geometry_msgs/WrenchStamped.
     pub wrenches: Vec<WrenchTopic>,
+    /// Topics of wrenches on a part that no tool applies, geometry_msgs/WrenchStamped; `{label}` is the
+    /// part.
+    pub part_wrenches: String,
     /// Topic of moving transforms, tf2_msgs/TFMessage.
     pub tf: String,
     /// Topic of fixed transforms, tf2_msgs/TFMessage.
@@ -284,6 +292,7 @@ impl Default for InputConfig {
             clouds: vec!["parts/points".into()],
             poses: "parts/{label}/pose".into(),
             wrenches: vec![WrenchTopic::default()],
+            part_wrenches: "parts/{label}/wrench".into(),
             tf: "/tf".into(),
             tf_static: "/tf_static".into(),
             fixed_frame: "world".into(),
@@ -311,7 +320,16 @@ impl InputConfig {
 
     /// The part whose pose a topic carries, if it is such a topic.
     pub fn pose_label(&self, topic: &str) -> Option<Label> {
-        let pattern = self.absolute(&self.poses);
+        self.label_in(&self.poses, topic)
+    }
+
+    /// The part that the wrenches of a topic act on, if it is such a topic.
+    pub fn part_wrench_label(&self, topic: &str) -> Option<Label> {
+        self.label_in(&self.part_wrenches, topic)
+    }
+
+    fn label_in(&self, pattern: &str, topic: &str) -> Option<Label> {
+        let pattern = self.absolute(pattern);
         let (before, after) = pattern.split_once("{label}")?;
         topic.strip_prefix(before)?.strip_suffix(after)?.parse().ok().map(Label)
     }
@@ -325,8 +343,13 @@ impl InputConfig {
         ] {
             positive_number(key, value)?;
         }
-        if self.poses.matches("{label}").count() != 1 {
-            return Err(("input.poses".into(), format!("`{}`, expected {{label}} in it, once", self.poses)));
+        for (key, pattern) in [("input.poses", &self.poses), ("input.part_wrenches", &self.part_wrenches)] {
+            if pattern.matches("{label}").count() != 1 {
+                return Err((key.into(), format!("`{pattern}`, expected {{label}} in it, once")));
+            }
+        }
+        if self.absolute(&self.poses) == self.absolute(&self.part_wrenches) {
+            return Err(("input".into(), format!("topic {} is given twice", self.absolute(&self.poses))));
         }
         let wrenches = self.wrenches.iter().map(|wrench| &wrench.topic);
         let names = self.clouds.iter().chain(wrenches).chain([&self.tf, &self.tf_static]);
@@ -470,6 +493,7 @@ mod tests {
             ("input: {tf_timeout_s: -1}", "key `input.tf_timeout_s`: -1, expected above 0"),
             ("input: {tf_timeout_s: .nan}", "key `input.tf_timeout_s`: NaN, expected above 0"),
             ("input: {poses: parts/pose}", "key `input.poses`: `parts/pose`, expected {label}"),
+            ("input: {part_wrenches: wrenches}", "key `input.part_wrenches`: `wrenches`, expected {label}"),
             ("input: {clouds: [wrench]}", "key `input`: topic /wrench is given twice"),
             ("gravity_m_s2: [0, 0]", "key `gravity_m_s2"),
             ("gravity_m_s2: [0, 0, -9810]", "key `gravity_m_s2`: [0.0, 0.0, -9810.0], expected at most"),

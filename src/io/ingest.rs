@@ -186,6 +186,11 @@ impl Ingest {
                 let content = Content::wrench(&message.wrench, source, &self.config, stamp)?;
                 Ok(WaitingMessage { stamp, frame: message.header.frame_id.clone(), content })
             }
+            (Role::PartWrench(label), Message::Wrench(message)) => {
+                let stamp = checked_stamp(&message.header)?;
+                let content = Content::part_wrench(&message.wrench, label, &self.config, stamp)?;
+                Ok(WaitingMessage { stamp, frame: message.header.frame_id.clone(), content })
+            }
             (Role::Pose(label), Message::Pose(message)) => {
                 let stamp = checked_stamp(&message.header)?;
                 let content = Content::pose(&message.pose, label, &self.config, stamp)?;
@@ -273,7 +278,7 @@ impl Ingest {
     fn count_arrival(&mut self, role: Role) {
         match role {
             Role::Cloud => self.counters.clouds_in += 1,
-            Role::Wrench(_) => self.counters.wrenches_in += 1,
+            Role::Wrench(_) | Role::PartWrench(_) => self.counters.wrenches_in += 1,
             Role::Pose(_) => self.counters.poses_in += 1,
             Role::Tf | Role::TfStatic => self.counters.tf_in += 1,
         }
@@ -282,7 +287,7 @@ impl Ingest {
     fn reject(&mut self, topic: &str, role: Role, rejection: Rejection) {
         let reasons = match role {
             Role::Cloud => &mut self.counters.clouds_dropped,
-            Role::Wrench(_) => &mut self.counters.wrenches_dropped,
+            Role::Wrench(_) | Role::PartWrench(_) => &mut self.counters.wrenches_dropped,
             Role::Pose(_) => &mut self.counters.poses_dropped,
             Role::Tf | Role::TfStatic => &mut self.counters.tf_dropped,
         };
@@ -313,7 +318,7 @@ impl<'a> Message<'a> {
     fn decode(role: Role, message: &'a [u8]) -> Result<Self, Rejection> {
         Ok(match role {
             Role::Cloud => Self::Cloud(decode(message)?),
-            Role::Wrench(_) => Self::Wrench(decode(message)?),
+            Role::Wrench(_) | Role::PartWrench(_) => Self::Wrench(decode(message)?),
             Role::Pose(_) => Self::Pose(Box::new(decode(message)?)),
             Role::Tf | Role::TfStatic => Self::Tf(decode(message)?),
         })

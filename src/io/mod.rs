@@ -10,6 +10,7 @@ pub mod config;
 pub mod counters;
 pub mod definitions;
 pub mod document;
+pub mod import;
 pub mod ingest;
 pub mod messages;
 pub mod model_file;

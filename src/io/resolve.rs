@@ -39,23 +39,38 @@ pub(super) struct WaitingMessage {
 #[derive(Debug)]
 pub(super) enum Content {
     Cloud { source: usize, points: Vec<SensorPoint> },
-    Wrench { source: usize, part: Option<Label>, force: Vector3<f64>, torque: Vector3<f64> },
+    Wrench { source: usize, part: Option<Label>, tool: bool, force: Vector3<f64>, torque: Vector3<f64> },
     Pose { label: Label, header_from_frame: Pose, covariance: Box<[[f64; 6]; 6]> },
 }
 
 impl Content {
-    /// A wrench on the object, whatever the sensor's sign.
+    /// What a tool does to the object, by the wrench topic of this index, whatever the sensor's sign.
     pub fn wrench(wrench: &Wrench, source: usize, config: &InputConfig, stamp: Stamp) -> Result<Self, Rejection> {
         let topic = config.wrenches.get(source);
         let sign = if topic.is_some_and(|topic| topic.reaction) { -1.0 } else { 1.0 };
+        let part = topic.and_then(|topic| topic.part.label());
+        Self::signed_wrench(wrench, sign, (source, part, true), stamp)
+    }
+
+    /// What acts on a part, by its own topic.
+    pub fn part_wrench(wrench: &Wrench, label: Label, config: &InputConfig, stamp: Stamp) -> Result<Self, Rejection> {
+        let source = config.wrenches.len() + label.0 as usize;
+        Self::signed_wrench(wrench, 1.0, (source, Some(label), false), stamp)
+    }
+
+    fn signed_wrench(
+        wrench: &Wrench,
+        sign: f64,
+        (source, part, tool): (usize, Option<Label>, bool),
+        stamp: Stamp,
+    ) -> Result<Self, Rejection> {
         let force = Vector3::from(wrench.force) * sign;
         let torque = Vector3::from(wrench.torque) * sign;
         if !force.iter().chain(&torque).all(|component| component.is_finite()) {
             let reason = format!("force {:?}, torque {:?}: not finite", force.as_slice(), torque.as_slice());
             return Err(Rejection::new(Some(stamp), "not_finite", reason));
         }
-        let part = topic.and_then(|topic| topic.part.label());
-        Ok(Self::Wrench { source, part, force, torque })
+        Ok(Self::Wrench { source, part, tool, force, torque })
     }
 
     /// A pose; without a rotation if its covariance says that none was measured.
@@ -97,10 +112,11 @@ impl WaitingMessage {
                 viewpoint_in_world: (!is_fixed).then_some(world_from_frame.translation),
                 points: points.iter().map(|point| in_world(point, world_from_frame)).collect(),
             }),
-            Content::Wrench { source, part, force, torque } => Input::Wrench(AppliedWrench {
+            Content::Wrench { source, part, tool, force, torque } => Input::Wrench(AppliedWrench {
                 stamp,
                 source,
                 part,
+                tool,
                 point_in_world: world_from_frame.translation,
                 force_in_world: world_from_frame.rotation * force,
                 torque_in_world: world_from_frame.rotation * torque,

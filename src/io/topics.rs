@@ -16,6 +16,8 @@ pub enum Role {
     Cloud,
     /// The wrench topic of this index in the configuration.
     Wrench(usize),
+    /// Wrenches on this part.
+    PartWrench(Label),
     /// Poses of this part.
     Pose(Label),
     /// Moving transforms.
@@ -37,7 +39,10 @@ impl Role {
         match topic {
             _ if is(&config.tf) => Some(Self::Tf),
             _ if is(&config.tf_static) => Some(Self::TfStatic),
-            _ => config.pose_label(topic).map(Self::Pose),
+            _ => {
+                let pose = config.pose_label(topic).map(Self::Pose);
+                pose.or_else(|| config.part_wrench_label(topic).map(Self::PartWrench))
+            }
         }
     }
 
@@ -45,7 +50,7 @@ impl Role {
     pub fn type_name(self) -> &'static str {
         match self {
             Self::Cloud => POINT_CLOUD_TYPE,
-            Self::Wrench(_) => WRENCH_TYPE,
+            Self::Wrench(_) | Self::PartWrench(_) => WRENCH_TYPE,
             Self::Pose(_) => POSE_TYPE,
             Self::Tf | Self::TfStatic => TF_TYPE,
         }
@@ -65,7 +70,7 @@ pub struct MissingTopics {
 
 impl MissingTopics {
     /// Compares configuration and bag; `None` if all is there. Poses stand in for clouds and the
-    /// other way round; transforms are not missed, as clouds may come in the fixed frame. A topic
+    /// other way round, a part's own wrench for a tool's; transforms are not missed, as clouds may come in the fixed frame. A topic
     /// without messages is as good as none.
     pub fn of(config: &InputConfig, bag: &BagSummary) -> Option<Self> {
         let mut roles = Vec::new();
@@ -86,7 +91,9 @@ impl MissingTopics {
         if !has_poses {
             config.clouds.iter().for_each(|name| require(name, POINT_CLOUD_TYPE));
         }
-        config.wrenches.iter().for_each(|wrench| require(&wrench.topic, WRENCH_TYPE));
+        if !roles.iter().any(|(_, role)| matches!(role, Role::PartWrench(_))) {
+            config.wrenches.iter().for_each(|wrench| require(&wrench.topic, WRENCH_TYPE));
+        }
         if missing.is_empty() && (has_clouds || has_poses) {
             return None;
         }

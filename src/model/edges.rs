@@ -15,6 +15,7 @@ use super::kinematics::{Axis, KinematicJoint, KinematicSettings, fit_kinematics}
 use super::window::{Contact, PoseMeasurement, WindowObservations};
 use crate::math::{Pose, Screw, orthonormal_pair};
 use crate::mechanism::JointType;
+use crate::registration::{fit_circle, fit_line};
 use crate::types::Label;
 
 /// Cost of one move \[nats\].
@@ -51,12 +52,14 @@ pub struct EdgeFit {
     pub by_window: Vec<f64>,
 }
 
-/// The windows seen from a parent that moves along `track` (by window and frame).
+/// The windows seen from a parent that moves along a track (by window and frame).
 pub fn relative_windows(
-    child: Label,
-    track: Option<&[Vec<Pose>]>,
+    child: &EdgePart,
+    parent: Option<(&EdgePart, &[Vec<Pose>])>,
     windows: &[&WindowObservations],
 ) -> Vec<WindowObservations> {
+    let (track, center) = (parent.map(|(_, track)| track), child.center);
+    let child = child.label;
     windows
         .iter()
         .enumerate()
@@ -69,7 +72,12 @@ pub fn relative_windows(
                     .get(&child)
                     .map(|poses| {
                         let seen = |(k, m): (usize, &Option<PoseMeasurement>)| {
-                            m.map(|m| PoseMeasurement { displacement: reference(k) * m.displacement, ..m })
+                            let m = m.as_ref()?;
+                            let relative = PoseMeasurement { displacement: reference(k) * m.displacement, ..*m };
+                            let own = parent.and_then(|(part, track)| {
+                                Some((part.center, window.own_measurement(part.label, k, &track[w][k])?))
+                            });
+                            Some(own.map_or(relative, |(about, own)| blurred(&relative, &center, own, &about)))
                         };
                         (child, poses.iter().enumerate().map(seen).collect())
                     })
@@ -80,6 +88,7 @@ pub fn relative_windows(
                 times_s: window.times_s.clone(),
                 poses: relative(&window.poses),
                 later_faces: relative(&window.later_faces),
+                direct: window.direct.clone(),
                 contacts: window
                     .contacts
                     .iter()
@@ -97,6 +106,24 @@ pub fn relative_windows(
             }
         })
         .collect()
+}
+
+/// A relative measurement with the noise of the parent's own, `about` the parent's reference point:
+/// (Λ⁻¹ + A Σ Aᵀ)⁻¹ with A = Ad of parent's reference point from the child's. The parent's own rotation
+/// must be measured.
+fn blurred(
+    relative: &PoseMeasurement,
+    center: &Vector3<f64>,
+    parent: &PoseMeasurement,
+    about: &Vector3<f64>,
+) -> PoseMeasurement {
+    let between = Pose::from_translation(-about) * relative.displacement * Pose::from_translation(*center);
+    let carried = between.adjoint_matrix();
+    // The parent's information in the child's axes is the inverse of A Σ Aᵀ.
+    let noise = carried.transpose() * parent.information * carried;
+    let own = relative.information;
+    let information = (own + noise).cholesky().map_or(own, |sum| own - own * sum.solve(&own));
+    PoseMeasurement { information: (information + information.transpose()) * 0.5, ..*relative }
 }
 
 /// Evidence of no motion at all relative to the parent \[nats\], and what each window adds to it.
@@ -187,6 +214,18 @@ pub fn axes_from_motion(part: &EdgePart, joint_type: JointType, windows: &[Windo
         }
     }
     let Some((_, first, second)) = best else { return Vec::new() };
+    let points = measured_points(part, windows);
+    if !points.is_empty() {
+        let seed = match joint_type {
+            JointType::Prismatic => fit_line(&points),
+            _ => fit_circle(&points),
+        };
+        let seed = seed.map(|(seed, _)| seed);
+        return seed
+            .map(|s| Axis { direction: s.direction, point: s.point.unwrap_or(part.center) })
+            .into_iter()
+            .collect();
+    }
     let shift = second.transform_point(&part.center) - first.transform_point(&part.center);
     match joint_type {
         JointType::Prismatic => {
@@ -206,6 +245,12 @@ pub fn axes_from_motion(part: &EdgePart, joint_type: JointType, windows: &[Windo
         }
         JointType::Rigid => Vec::new(),
     }
+}
+
+/// Where a part's point was measured to be, where that is all that was measured.
+fn measured_points(part: &EdgePart, windows: &[WindowObservations]) -> Vec<Vector3<f64>> {
+    let poses = windows.iter().filter_map(|window| window.poses.get(&part.label)).flatten().flatten();
+    poses.filter(|m| !m.rotation_is_measured()).map(|m| m.point(&part.center)).collect()
 }
 
 /// Far axes that turn a nearly straight motion.
@@ -242,14 +287,14 @@ fn start_positions(joint: &KinematicJoint, window: &WindowObservations, rests: b
 
 /// The joint position whose displacement is nearest a measured one, from `start`.
 pub fn nearest_position(joint: &KinematicJoint, screw: &Screw, measured: &PoseMeasurement, start: f64) -> f64 {
-    let residual = |q: f64| {
-        (Pose::from_translation(-joint.center)
-            * measured.displacement.inverse()
-            * screw.displacement(q)
-            * Pose::from_translation(joint.center))
-        .log()
-    };
+    let compare = |q: f64| measured.compare(&measured.information, &joint.center, &screw.displacement(q));
+    let residual = |q: f64| compare(q).0;
     let guesses = match joint.joint_type {
+        JointType::Revolute if !measured.rotation_is_measured() => {
+            let from = joint.center - joint.axis.point;
+            let to = measured.point(&joint.center) - joint.axis.point;
+            [start, joint.axis.direction.dot(&from.cross(&to)).atan2(from.dot(&to) - axial(joint, &from, &to))]
+        }
         JointType::Revolute => {
             let rotation = measured.displacement.quaternion();
             let turn = 2.0 * rotation.imag().dot(&joint.axis.direction).atan2(rotation.w);
@@ -265,18 +310,23 @@ pub fn nearest_position(joint: &KinematicJoint, screw: &Screw, measured: &PoseMe
         for _ in 0..4 {
             let h = 1e-5;
             let slope = (residual(q + h) - residual(q - h)) / (2.0 * h);
-            let weighted = measured.information * slope;
+            let weighted = compare(q).1 * slope;
             let curvature = weighted.dot(&slope);
             if curvature < 1e-6 {
                 break;
             }
             q -= (weighted.dot(&residual(q)) / curvature).clamp(-0.3, 0.3);
         }
-        let r = residual(q);
-        let cost = r.dot(&(measured.information * r));
+        let (r, information) = compare(q);
+        let cost = r.dot(&(information * r));
         if cost < best.0 {
             best = (cost, q);
         }
     }
     best.1
+}
+
+/// Product of two vectors' components along a joint's axis \[m²\].
+fn axial(joint: &KinematicJoint, from: &Vector3<f64>, to: &Vector3<f64>) -> f64 {
+    joint.axis.direction.dot(from) * joint.axis.direction.dot(to)
 }

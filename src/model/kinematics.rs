@@ -34,6 +34,8 @@ const DIRECTION_WIDENING: f64 = 1.3;
 const POSITION_WIDENING: f64 = 2.0;
 /// How closely axes follow the faces they are aligned with \[rad\].
 const ALIGNED_SIGMA: f64 = 0.007;
+/// A reference pose's rotation that was not measured may be off by any angle: it does not matter \[rad⁻²\].
+const UNMEASURED_INFORMATION: f64 = 1.0;
 /// A window is tested for motion in this many blocks of frames.
 const REST_BLOCKS: usize = 6;
 /// Score at which rest is given up: far beyond χ² with `REST_BLOCKS` degrees of freedom, as frames
@@ -310,6 +312,9 @@ struct Problem<'a> {
     contact_points: Vec<Vec<Vector3<f64>>>,
     tool_offset: Vector3<f64>,
     by_label: BTreeMap<Label, usize>,
+    /// By joint: the information of the pose that its child's displacements are counted from, where a
+    /// pose topic measures them.
+    references: Vec<Option<Matrix6<f64>>>,
 }
 
 impl<'a> Problem<'a> {
@@ -320,6 +325,8 @@ impl<'a> Problem<'a> {
         settings: &'a KinematicSettings,
     ) -> Self {
         let by_label = joints.iter().enumerate().map(|(i, j)| (j.child, i)).collect();
+        let reference = |j: &KinematicJoint| windows.iter().find_map(|w| w.direct.get(&j.child)).copied();
+        let references = joints.iter().map(reference).collect();
         let mut problem = Self {
             joints,
             windows,
@@ -333,6 +340,7 @@ impl<'a> Problem<'a> {
             contact_points: Vec::new(),
             tool_offset: Vector3::zeros(),
             by_label,
+            references,
         };
         problem.alignments = vec![0.0; problem.joints.len()];
         problem.face_errors = vec![[Vector6::zeros(); 2]; problem.joints.len()];
@@ -381,6 +389,9 @@ impl<'a> Problem<'a> {
         let one = |w: usize, j: usize, frame: usize, face: usize| {
             let joint = &self.joints[j];
             let raw = self.measured(w, j, frame, face)?.information;
+            if self.references[j].is_some() {
+                return Some(raw);
+            }
             let scale = Vector6::new(joint.radius, joint.radius, joint.radius, 1.0, 1.0, 1.0);
             let scaled = Matrix6::from_fn(|i, j| raw[(i, j)] / (scale[i] * scale[j]));
             let mut eigen = scaled.symmetric_eigen();
@@ -406,23 +417,16 @@ impl<'a> Problem<'a> {
     }
 
     /// Residual and information of each measurement of a joint's child in a frame, by faces.
-    ///
-    /// The first is which rigid error it shares, if any.
-    fn residuals(
-        &self,
-        w: usize,
-        j: usize,
-        frame: usize,
-        predicted: &Pose,
-    ) -> impl Iterator<Item = (Option<usize>, Vector6<f64>, Matrix6<f64>)> {
+    fn residuals(&self, w: usize, j: usize, frame: usize, predicted: &Pose) -> impl Iterator<Item = Residual> {
         let turned = self.joints[j].joint_type == JointType::Revolute
             && (predicted.rotation - Matrix3::identity()).norm() > TURNED;
         let one = |face: usize| {
-            let information = self.information[w][j][frame][face]?;
+            let information = self.information[w][j][frame][face].as_ref()?;
             let measured = self.measured(w, j, frame, face)?;
-            let r = pose_residual(&self.joints[j], &measured.displacement, predicted);
-            let error = (face == 1 || turned).then_some(face);
-            Some((error, error.map_or(r, |e| r - self.face_errors[j][e]), information))
+            let (r, information) = measured.compare(information, &self.joints[j].center, predicted);
+            let error = (face == 1 || turned || self.references[j].is_some()).then_some(face);
+            let value = error.map_or(r, |e| r - self.face_errors[j][e]);
+            Some(Residual { error, value, information, dimensions: measured.dimensions() })
         };
         [one(0), one(1)].into_iter().flatten()
     }
@@ -461,8 +465,8 @@ impl<'a> Problem<'a> {
         for frame in 0..window.times_s.len() {
             let displacements = forward(&self.joints, |j| self.positions[w][j][frame]);
             for (j, displacement) in displacements.iter().enumerate() {
-                for (_, r, information) in self.residuals(w, j, frame, displacement) {
-                    cost += self.student_cost(r.dot(&(information * r)), 6.0);
+                for r in self.residuals(w, j, frame, displacement) {
+                    cost += self.student_cost(r.chi_squared(), r.dimensions);
                 }
             }
         }
@@ -490,8 +494,12 @@ impl<'a> Problem<'a> {
         self.axis_count() + 12 * self.joints.len() + 3
     }
 
-    /// Prior information of a joint's face error, per component.
+    /// Prior information of a joint's face error, per component. Where a pose topic measures the part,
+    /// the first is the error of the pose that its displacements are counted from.
     fn face_error_information(&self, joint: usize, error: usize) -> Vector6<f64> {
+        if let Some(reference) = self.references[joint].filter(|_| error == 0) {
+            return reference.diagonal().map(|information| information.max(UNMEASURED_INFORMATION));
+        }
         let length = FACE_ERROR_SIGMA[error].powi(-2);
         let angle = length * self.joints[joint].radius.powi(2);
         Vector6::new(angle, angle, angle, length, length, length)
@@ -525,14 +533,14 @@ impl<'a> Problem<'a> {
             for (j, joint) in self.joints.iter().enumerate() {
                 let into_body = (Pose::from_translation(-joint.center) * displacements[j].inverse()).adjoint_matrix();
                 let twists: Vec<_> = columns[j].iter().map(|(at, v)| (*at, into_body * v)).collect();
-                for (error, r, information) in self.residuals(w, j, frame, &displacements[j]) {
-                    let weight = self.student_weight(r.dot(&(information * r)), 6.0);
+                for r in self.residuals(w, j, frame, &displacements[j]) {
+                    let weight = self.student_weight(r.chi_squared(), r.dimensions);
                     let mut jacobian = twists.clone();
-                    if let Some(error) = error {
+                    if let Some(error) = r.error {
                         let unit = |i: usize| -Matrix6::identity().column(i);
                         jacobian.extend((0..6).map(|i| (Slot::Global(axes + 12 * j + 6 * error + i), unit(i))));
                     }
-                    accumulate(&mut system, &jacobian, &(information * weight), &r);
+                    accumulate(&mut system, &jacobian, &(r.information * weight), &r.value);
                 }
             }
             for (c, x, sigma) in touches {
@@ -694,7 +702,8 @@ impl<'a> Problem<'a> {
     /// Counts, for every frame, the frames of its part within `shared_distance` of it.
     fn share_errors(&mut self) {
         let mut sharing: BTreeMap<(usize, usize, usize), f64> = BTreeMap::new();
-        for j in 0..self.joints.len() {
+        // What a pose topic measures shares no registration error.
+        for j in (0..self.joints.len()).filter(|&j| self.references[j].is_none()) {
             let mut places = Vec::new();
             for (w, window) in self.windows.iter().enumerate() {
                 for frame in 0..window.times_s.len() {
@@ -790,9 +799,10 @@ impl<'a> Problem<'a> {
         let mut covariance = matrix.cholesky().map_or_else(|| DMatrix::identity(globals, globals), |c| c.inverse());
         let mut widening = DVector::repeat(globals, 1.0);
         let mut at = 0;
-        for joint in &self.joints {
+        for (joint, reference) in self.joints.iter().zip(&self.references) {
             for i in 0..joint.axis_parameters() {
-                widening[at + i] = if i < 2 { DIRECTION_WIDENING } else { POSITION_WIDENING };
+                let registration = if i < 2 { DIRECTION_WIDENING } else { POSITION_WIDENING };
+                widening[at + i] = if reference.is_some() { 1.0 } else { registration };
             }
             at += joint.axis_parameters();
         }
@@ -874,10 +884,19 @@ fn accumulate<const R: usize>(
     }
 }
 
-/// log(T(−c) D_measured⁻¹ D_predicted T(c)), (angular, linear).
-fn pose_residual(joint: &KinematicJoint, measured: &Pose, predicted: &Pose) -> Vector6<f64> {
-    let center = joint.center;
-    (Pose::from_translation(-center) * measured.inverse() * *predicted * Pose::from_translation(center)).log()
+/// What a fit leaves of a measurement.
+struct Residual {
+    /// Which rigid error it shares, if any.
+    error: Option<usize>,
+    value: Vector6<f64>,
+    information: Matrix6<f64>,
+    dimensions: f64,
+}
+
+impl Residual {
+    fn chi_squared(&self) -> f64 {
+        self.value.dot(&(self.information * self.value))
+    }
 }
 
 /// Splits frames into runs within which a position stays inside its own uncertainty.

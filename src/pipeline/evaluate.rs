@@ -85,7 +85,7 @@ impl Scoring {
 impl Learner {
     /// Where the known joints were in a window's frames, each part measured against its model.
     fn measured_path(&mut self, job: &WindowJob) -> MeasuredPath {
-        let motions = explain_window(&self.scene(job));
+        let motions = explain_window(&self.scene(job), self.posed_motions(job).0);
         let settings = AlignmentSettings { gate: GATE, ..AlignmentSettings::default() };
         for (label, motion) in &motions {
             if let Some(end) = motion.displacements.last() {
@@ -106,6 +106,8 @@ impl Learner {
                     let scan = job.frames[k].scans.get(&joint.child);
                     let seen = self.models.get(&joint.child).zip(scan);
                     let seen = seen.and_then(|(model, scan)| measure(model, scan, &expected, &settings));
+                    let posed = job.frames[k].poses.get(&joint.child).zip(self.posed.get(&joint.child));
+                    let seen = posed.map(|(pose, part)| part.measurement(pose)).or(seen);
                     if let Some(measured) = seen {
                         let displacement = parent(k).inverse() * measured.displacement;
                         last = nearest_position(joint, &screw, &PoseMeasurement { displacement, ..measured }, last);

@@ -11,6 +11,7 @@ use nalgebra::{Matrix6, Vector3, Vector6};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use super::poses::SeenPose;
 use crate::math::{Pose, Screw};
 use crate::mechanism::JointType;
 use crate::model::{
@@ -44,6 +45,10 @@ pub struct Frame {
     pub time_s: f64,
     /// Each part's points.
     pub scans: BTreeMap<Label, Vec<ScanPoint>>,
+    /// The parts whose pose a topic measures; they have no scans.
+    pub poses: BTreeMap<Label, SeenPose>,
+    /// Whether one of these moves.
+    pub moves: bool,
 }
 
 /// What a part's scans cost where its pose is known.
@@ -91,11 +96,12 @@ pub struct Motion {
     pub seed: Option<(Option<Label>, AxisSeed)>,
 }
 
-/// The motions of all parts with a model, but the root.
-pub fn explain_window(scene: &Scene<'_>) -> BTreeMap<Label, Motion> {
-    let mut motions: BTreeMap<Label, Motion> = BTreeMap::new();
+/// The motions of all parts with a model, but the root; `measured` are those that need no explanation.
+pub fn explain_window(scene: &Scene<'_>, measured: BTreeMap<Label, Motion>) -> BTreeMap<Label, Motion> {
+    let mut motions = measured;
     let mut open: Vec<Label> = Vec::new();
-    for &label in scene.models.keys().filter(|&&label| Some(label) != scene.root) {
+    let unknown: Vec<Label> = scene.models.keys().copied().filter(|l| !motions.contains_key(l)).collect();
+    for label in unknown.into_iter().filter(|&label| Some(label) != scene.root) {
         let still = scene.evaluate(label, |_| scene.start_of(label));
         if still.excess < EXPLAINED && scene.tool_miss(label, &still.displacements) < TOOL_EXPLAINED {
             motions.insert(label, still);

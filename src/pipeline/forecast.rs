@@ -257,7 +257,7 @@ impl Forecaster {
         self.zero = Some(zero);
         let early = std::mem::take(&mut self.early);
         let mut outputs: Vec<Output> = early.iter().flat_map(|wrench| self.push_wrench(wrench)).collect();
-        self.labels.extend(frame.scans.keys());
+        self.labels.extend(frame.scans.keys().chain(frame.poses.keys()));
         let touches = self.toucher.touches(&self.samples, &frame, &rest_force);
         let now_s = frame.time_s;
         let tool_sigma = self.toucher.tool_sigma();
@@ -542,8 +542,15 @@ fn follow(
     let (mut measured, mut still) = (BTreeMap::new(), true);
     let settings = AlignmentSettings { gate: POSE_GATE, ..AlignmentSettings::default() };
     for (label, displacement) in filter.moving_parts() {
-        let (Some(model), Some(scan)) = (learner.models.get(&label), seen.frame.scans.get(&label)) else { continue };
-        let Some(measurement) = measure(model, scan, &displacement, &settings) else { continue };
+        let Some(model) = learner.models.get(&label) else { continue };
+        let posed = seen.frame.poses.get(&label).zip(learner.posed.get(&label));
+        let measurement = if let Some((pose, part)) = posed {
+            part.measurement(pose)
+        } else {
+            let Some(scan) = seen.frame.scans.get(&label) else { continue };
+            let Some(measurement) = measure(model, scan, &displacement, &settings) else { continue };
+            measurement
+        };
         filter.correct_by_pose(label, &measurement);
         let (before, after) = (last.get(&label), measurement.displacement);
         still &= before.is_some_and(|before| travel(model, before, &after) < STILL);

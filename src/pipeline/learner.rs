@@ -8,13 +8,14 @@ use serde::{Deserialize, Serialize};
 
 use super::explain::{Baseline, Frame, Motion, Scene, explain_window, measure_faces, travel};
 use super::keyframes::Keyframes;
+use super::poses::{POSED_RADIUS, PosedPart, measured_motion};
 use crate::geometry::{HullProperties, hull_properties};
 use crate::inference::SamplingSettings;
 use crate::math::Pose;
 use crate::mechanism::JointType;
 use crate::model::{
-    Axis, Contact, EdgeFit, EdgePart, KinematicFit, KinematicJoint, KinematicSettings, WindowObservations,
-    axes_from_motion, fit_kinematics, moving_evidence, relative_windows, rigid_evidence,
+    Axis, Contact, EdgeFit, EdgePart, KinematicFit, KinematicJoint, KinematicSettings, PoseMeasurement,
+    WindowObservations, axes_from_motion, fit_kinematics, moving_evidence, relative_windows, rigid_evidence,
 };
 use crate::model::{DynamicsInput, DynamicsLearner, DynamicsPosterior, WindowInference};
 use crate::registration::{
@@ -101,6 +102,8 @@ pub struct Learner {
     zero: Option<crate::types::Stamp>,
     /// Whether it was given: else it is what the evidence says, and may change.
     pub root_is_given: bool,
+    /// A name for the world, for when it is none of the parts.
+    pub world: Option<Label>,
     /// Whether the tool's position is an observation.
     pub use_tool: bool,
     /// Reference models; saved apart.
@@ -141,6 +144,8 @@ pub struct Learner {
     pub records: Vec<WindowRecord>,
     /// Hulls of the parts, as first seen.
     pub hulls: BTreeMap<Label, HullProperties>,
+    /// Parts whose pose a topic measures, as first seen; they have models without surfels.
+    pub posed: BTreeMap<Label, PosedPart>,
 }
 
 impl Learner {
@@ -155,6 +160,7 @@ impl Learner {
             sampling: None,
             zero: None,
             root_is_given: true,
+            world: None,
             use_tool,
             models,
             reference,
@@ -174,7 +180,49 @@ impl Learner {
             inferences: Vec::new(),
             records: Vec::new(),
             hulls: BTreeMap::new(),
+            posed: BTreeMap::new(),
         }
+    }
+
+    /// Adds a part whose pose a topic measures, where it was at the reference configuration.
+    pub fn add_posed(&mut self, label: Label, part: PosedPart) {
+        let origin = part.world_from_frame.translation;
+        self.models.insert(label, PartModel::of_frame(origin, POSED_RADIUS));
+        self.hulls.insert(label, HullProperties::guess(origin, POSED_RADIUS));
+        self.posed.insert(label, part);
+    }
+
+    /// Adds the parts whose poses are measured for the first time.
+    fn meet_posed(&mut self, job: &WindowJob) {
+        for (label, seen) in job.frames.iter().flat_map(|frame| &frame.poses) {
+            // A part that was not there at the first look is taken to have been at rest until now.
+            if !self.posed.contains_key(label) {
+                let part = PosedPart { world_from_frame: seen.world_from_frame, information: seen.information };
+                self.add_posed(*label, part);
+            }
+        }
+        for label in self.posed.keys() {
+            // Windows before it was seen.
+            let rested = |window: &WindowObservations| vec![Pose::identity(); window.times_s.len()];
+            self.tracks.entry(*label).or_insert_with(|| self.windows.iter().map(rested).collect());
+        }
+    }
+
+    /// The motions that pose topics measured in a window, with the measurements.
+    pub(super) fn posed_motions(
+        &self,
+        job: &WindowJob,
+    ) -> (BTreeMap<Label, Motion>, BTreeMap<Label, Vec<Option<PoseMeasurement>>>) {
+        let (mut motions, mut all) = (BTreeMap::new(), BTreeMap::new());
+        let fixed = |label: &Label| self.root_is_given && *label == self.root;
+        for (label, part) in self.posed.iter().filter(|(label, _)| !fixed(label)) {
+            let measured: Vec<_> =
+                job.frames.iter().map(|f| f.poses.get(label).map(|seen| part.measurement(seen))).collect();
+            let start = self.displacements.get(label).copied().unwrap_or_else(Pose::identity);
+            motions.insert(*label, measured_motion(&start, &part.world_from_frame.translation, &measured));
+            all.insert(*label, measured);
+        }
+        (motions, all)
     }
 
     /// The likeliest joints so far, parents first.
@@ -233,18 +281,23 @@ impl Learner {
 
     /// Learns one window.
     pub fn learn(&mut self, job: &WindowJob) {
+        self.meet_posed(job);
+        let (measured, poses) = self.posed_motions(job);
         let scene = self.scene(job);
-        let doubted = !self.root_is_given && scene.has_left(self.root);
-        let motions = explain_window(&Scene { root: (!doubted).then_some(self.root), ..scene });
-        for (label, motion) in &motions {
-            tracing::debug!(%label, moved = motion.moved, excess = motion.excess, seed = ?motion.seed, "motion");
-        }
+        let doubted = !self.root_is_given && !measured.contains_key(&self.root) && scene.has_left(self.root);
+        let motions = explain_window(&Scene { root: (!doubted).then_some(self.root), ..scene }, measured);
+        let direct = poses.keys().filter_map(|label| Some((*label, self.posed.get(label)?.information)));
         let observations = WindowObservations {
             times_s: job.frames.iter().map(|f| f.time_s).collect(),
             contacts: if self.use_tool { job.contacts.clone() } else { Vec::new() },
             wrenches: job.wrenches.clone(),
+            direct: direct.collect(),
+            poses,
             ..WindowObservations::default()
         };
+        for (label, motion) in &motions {
+            tracing::debug!(%label, moved = motion.moved, excess = motion.excess, seed = ?motion.seed, "motion");
+        }
         let moved = |label: &Label| motions.get(label).is_some_and(|m| m.moved);
         self.touched.extend(job.contacts.iter().map(|c| c.label).filter(moved));
         for (label, motion) in &motions {
@@ -320,6 +373,9 @@ impl Learner {
 
     /// Measures a part's poses in the last window, about its track.
     fn measure(&mut self, label: Label, frames: &[Frame]) {
+        if self.posed.contains_key(&label) {
+            return;
+        }
         let settings = AlignmentSettings { gate: 0.02, ..AlignmentSettings::default() };
         let Some(track) = self.tracks.get(&label).and_then(|t| t.last()) else { return };
         let faces: Vec<_> = frames
@@ -365,6 +421,7 @@ impl Learner {
         if self.root_is_given {
             return;
         }
+        let world = self.world;
         let farthest = |label: &Label| {
             let model = &self.models[label];
             let all = self.tracks.get(label).into_iter().flatten().flatten();
@@ -374,7 +431,7 @@ impl Learner {
         let still = self.models.keys().filter(|label| !self.ever_moved(**label));
         let largest = still.max_by_key(|label| (size(label), std::cmp::Reverse(**label)));
         let least_far = || self.models.keys().min_by(|a, b| farthest(a).total_cmp(&farthest(b)));
-        if let Some(root) = largest.or_else(least_far).copied() {
+        if let Some(root) = largest.copied().or(world).or_else(|| least_far().copied()) {
             self.root = root;
         }
     }
@@ -405,8 +462,9 @@ impl Learner {
     fn weigh_edge(&self, child: Label, parent: Option<Label>, motions: &BTreeMap<Label, Motion>) -> ParentEvidence {
         let windows: Vec<&WindowObservations> = self.windows.iter().collect();
         let part = self.part(child);
-        let track = parent.map(|p| self.tracks[&p].as_slice());
-        let relative = relative_windows(child, track, &windows);
+        let carrier = parent.map(|p| self.part(p));
+        let carrier = carrier.as_ref().map(|part| (part, self.tracks[&part.label].as_slice()));
+        let relative = relative_windows(&part, carrier, &windows);
         let resting = self.resting_windows(child, parent);
         let (rigid, rigid_by_window) = rigid_evidence(&part, &relative, &self.settings);
         let past = self.past_evidence(child, parent);
@@ -537,6 +595,9 @@ impl Learner {
     /// Log prior of a joint between two parts by the gap between their surfaces: what is joined
     /// touches. `None`: the nearest of the parts that never moved.
     pub(super) fn log_contact_prior(&self, child: Label, parent: Option<Label>) -> f64 {
+        if self.posed.contains_key(&child) || parent.is_some_and(|parent| self.posed.contains_key(&parent)) {
+            return 0.0;
+        }
         let gap = |other: Label| self.gaps.get(&(child.min(other), child.max(other))).copied().unwrap_or(0.0);
         let gap = match parent {
             Some(parent) => gap(parent),

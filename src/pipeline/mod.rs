@@ -6,6 +6,7 @@ mod forecast;
 mod keyframes;
 mod learner;
 mod planning;
+mod poses;
 mod posterior;
 mod retention;
 mod saved;
@@ -24,6 +25,7 @@ pub use evaluate::{PartScore, Scores};
 pub use explain::Frame;
 pub use learner::{Learner, ParentEvidence, WindowJob};
 pub use planning::Planner;
+pub use poses::PoseSettings;
 pub use saved::{ResumeError, SavedObject, SavedObjectRef, Snapshot};
 pub use windows::{FrameAssembler, WindowCutter, WindowSettings};
 pub use worker::{ClosedWindow, Learned, Worker};
@@ -36,6 +38,7 @@ use crate::types::{Input, Label, Stamp};
 use evaluate::Scoring;
 use explain::{FEWEST_POINTS, measurement_of, travel};
 use forecast::Forecaster;
+use poses::{POSED_RADIUS, PoseBuffer, PosedPart, RECORD_GAP, references};
 use saved::Resumed;
 use windows::frame_of;
 use working_frame::WorkingFrame;
@@ -56,6 +59,8 @@ pub struct PipelineSettings {
     pub points_per_part: usize,
     /// When windows open and close.
     pub windows: WindowSettings,
+    /// How poses that a topic measures become observations.
+    pub poses: PoseSettings,
     /// What is assumed of the pose measurements.
     pub kinematics: KinematicSettings,
     /// Gravity in world \[m/s²\].
@@ -121,6 +126,8 @@ pub struct Pipeline {
     working_frame: WorkingFrame,
     zero: Option<Stamp>,
     assembler: FrameAssembler,
+    poses: PoseBuffer,
+    last_frame_s: Option<f64>,
     early: Vec<Input>,
     cutter: Option<WindowCutter>,
     accumulators: BTreeMap<Label, SurfelAccumulator>,
@@ -152,6 +159,8 @@ impl Pipeline {
         let forecaster = settings.predict.then(|| Forecaster::new(&settings));
         Self {
             forecaster,
+            poses: PoseBuffer::new(settings.poses),
+            last_frame_s: None,
             settings,
             working_frame: WorkingFrame::Open(Vec::new()),
             zero: None,
@@ -197,6 +206,10 @@ impl Pipeline {
                 let ready = self.assembler.push(cloud);
                 ready.into_iter().flat_map(|(stamp, clouds)| self.push_frame(stamp, &clouds)).collect()
             }
+            Input::Pose(pose) => {
+                let ready = self.poses.push(*pose);
+                ready.into_iter().flat_map(|stamp| self.push_frame(stamp, &[])).collect()
+            }
             other => {
                 let predictions = match (&mut self.forecaster, &other) {
                     (Some(forecaster), Input::Wrench(wrench)) => forecaster.push_wrench(wrench),
@@ -217,6 +230,9 @@ impl Pipeline {
         for (stamp, clouds) in self.assembler.flush() {
             outputs.extend(self.push_frame(stamp, &clouds));
         }
+        for stamp in self.poses.flush() {
+            outputs.extend(self.push_frame(stamp, &[]));
+        }
         let job = self.cutter.as_mut().and_then(|c| c.flush(nearest_label));
         outputs.extend(job.and_then(|job| self.close(job)));
         outputs.extend(self.forecaster.iter_mut().flat_map(Forecaster::finish));
@@ -225,19 +241,30 @@ impl Pipeline {
 
     fn push_frame(&mut self, stamp: Stamp, clouds: &[crate::types::SegmentedCloud]) -> Vec<Output> {
         let zero = self.zero.unwrap_or_else(|| {
-            let first = self.early.iter().map(Input::stamp).chain([stamp]).min();
+            let first = self.early.iter().map(Input::stamp).chain(self.poses.first()).chain([stamp]).min();
             self.time_zero(first.unwrap_or(stamp))
         });
         self.zero = Some(zero);
         self.newest = self.newest.max(Some(stamp));
+        if !clouds.is_empty() {
+            self.poses.saw_clouds(stamp);
+        }
         let cutter = self.cutter.get_or_insert_with(|| WindowCutter::new(self.settings.windows, zero));
         for input in self.early.drain(..) {
             if let Input::Wrench(wrench) = input {
                 cutter.push_wrench(wrench);
             }
         }
-        let frame = frame_of(stamp.seconds_since(zero), clouds, self.settings.points_per_part);
-        let mut outputs: Vec<Output> = self.take_up(&frame, zero).into_iter().collect();
+        let mut frame = frame_of(stamp.seconds_since(zero), clouds, self.settings.points_per_part);
+        let mut outputs = Vec::new();
+        if clouds.is_empty() && self.last_frame_s.is_some_and(|last_s| frame.time_s - last_s > RECORD_GAP) {
+            outputs.extend(self.end_record());
+        }
+        self.last_frame_s = Some(frame.time_s);
+        frame.scans.retain(|label, _| !self.poses.measures(*label));
+        frame.poses = self.poses.at(stamp);
+        frame.moves = self.poses.something_moves(frame.time_s, &frame.poses);
+        outputs.extend(self.take_up(&frame, zero));
         outputs.extend(self.observe(&frame));
         let moving = self.moving;
         let seen = self.forecaster.is_some().then(|| frame.clone());
@@ -271,10 +298,21 @@ impl Pipeline {
             if let Some(learner) = self.learner.as_deref().filter(|_| closed) {
                 forecaster.learned(learner, None);
             }
-            let rest_force = self.cutter.as_ref().and_then(|cutter| cutter.rest_force).unwrap_or_default();
+            let rest_force = self.cutter.as_ref().and_then(WindowCutter::rest_force).unwrap_or_default();
             outputs.extend(forecaster.push_frame(frame, self.learner.as_deref(), zero, rest_force));
         }
         outputs
+    }
+
+    /// Poses stayed away: the window that is open ends with the last of them.
+    fn end_record(&mut self) -> Option<Output> {
+        self.poses.end_record();
+        let job = self.cutter.as_mut().and_then(|cutter| cutter.end_record(nearest_label))?;
+        let output = self.close(job);
+        if let (Some(forecaster), Some(learner), false) = (&mut self.forecaster, &self.learner, self.settings.live) {
+            forecaster.learned(learner, None);
+        }
+        output
     }
 
     /// The object at rest has been seen: its models are made, just before the first window.
@@ -289,9 +327,9 @@ impl Pipeline {
             }
         }
         let accumulators = std::mem::take(&mut self.accumulators);
-        let root = self.settings.root.unwrap_or_else(|| {
-            accumulators.iter().max_by_key(|(_, a)| a.voxel_means(1.0).len()).map_or(Label(0), |(l, _)| *l)
-        });
+        let posed = references(&self.reference);
+        let largest = accumulators.iter().max_by_key(|(_, a)| a.voxel_means(1.0).len()).map(|(label, _)| *label);
+        let root = self.settings.root.or(largest).unwrap_or_else(|| unused_label(&posed));
         let mut learner = Learner::new(root, self.settings.use_tool, accumulators);
         learner.settings = self.settings.kinematics;
         learner.sampling = self.settings.sampling;
@@ -299,6 +337,10 @@ impl Pipeline {
         learner.root_is_given = self.settings.root.is_some();
         learner.dynamics = DynamicsLearner::new(self.gravity_in_work());
         learner.calibrate(&self.reference);
+        learner.world = (self.settings.root.is_none() && largest.is_none()).then_some(root);
+        for (label, part) in posed {
+            learner.add_posed(label, part);
+        }
         self.reference.clear();
         self.learner = Some(Arc::new(learner));
     }
@@ -347,19 +389,16 @@ impl Pipeline {
 
     /// Registers every part of a frame, from where it was.
     fn observe(&mut self, frame: &Frame) -> Vec<Output> {
+        let mut outputs = self.observe_poses(frame);
         let Some(learner) = &self.learner else {
-            return frame
-                .scans
-                .keys()
-                .map(|label| Output::Observation {
-                    time_s: frame.time_s,
-                    label: *label,
-                    measurement: PoseMeasurement { displacement: Pose::identity(), information: Matrix6::zeros() },
-                })
-                .collect();
+            outputs.extend(frame.scans.keys().map(|label| Output::Observation {
+                time_s: frame.time_s,
+                label: *label,
+                measurement: PoseMeasurement { displacement: Pose::identity(), information: Matrix6::zeros() },
+            }));
+            return outputs;
         };
         let settings = AlignmentSettings::default();
-        let mut outputs = Vec::new();
         for (label, scan) in &frame.scans {
             let last = self.current.get(label).copied().unwrap_or_else(Pose::identity);
             let mut measurement = PoseMeasurement { displacement: last, information: Matrix6::zeros() };
@@ -382,6 +421,21 @@ impl Pipeline {
             self.recent.remove(0);
         }
         outputs
+    }
+
+    /// What pose topics measured in a frame; until the first window opens, since the first frame.
+    fn observe_poses(&self, frame: &Frame) -> Vec<Output> {
+        let learned = |label| self.learner.as_ref().and_then(|learner| learner.posed.get(label)).copied();
+        let first = self.reference.first().unwrap_or(frame);
+        let outputs = frame.poses.iter().map(|(label, seen)| {
+            let seen_first = || first.poses.get(label).unwrap_or(seen);
+            let part = learned(label).unwrap_or_else(|| {
+                let seen = seen_first();
+                PosedPart { world_from_frame: seen.world_from_frame, information: seen.information }
+            });
+            Output::Observation { time_s: frame.time_s, label: *label, measurement: part.measurement(seen) }
+        });
+        outputs.collect()
     }
 
     /// Whether a part is seen away from where it was a few frames ago: the older pose must explain
@@ -411,6 +465,14 @@ fn nearest_label(place: &Vector3<f64>, frame: &Frame) -> Option<Label> {
             distances.select_nth_unstable_by(rank, f64::total_cmp);
             Some((distances[rank], *label))
         })
+        .chain(frame.poses.iter().map(|(label, seen)| {
+            (((seen.world_from_frame.translation - place).norm() - POSED_RADIUS).max(0.0), *label)
+        }))
         .min_by(|a, b| a.0.total_cmp(&b.0))
         .map(|(_, label)| label)
+}
+
+/// A name for the world, where it is none of the parts.
+fn unused_label(parts: &BTreeMap<Label, PosedPart>) -> Label {
+    (0..).map(Label).find(|label| !parts.contains_key(label)).unwrap_or_default()
 }

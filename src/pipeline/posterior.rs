@@ -1,11 +1,12 @@
 //! The posterior as it is published: what the learner knows, over all trees.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{DMatrix, Matrix3, Vector3};
 
+use super::poses::POSED_RADIUS;
 use super::{Learner, ParentEvidence, Pipeline};
-use crate::geometry::hull_properties;
+use crate::geometry::{HullProperties, hull_properties};
 use crate::mechanism::JointType;
 use crate::model::{Axis, DynamicsPosterior, JointDynamics, KinematicFit};
 use crate::registration::PartModel;
@@ -28,9 +29,12 @@ impl Pipeline {
         if let Some(learner) = &self.learner {
             return Some(learner.posterior());
         }
-        let points = self.surfaces_in_work();
-        let likeliest = || points.iter().max_by_key(|(_, points)| points.len()).map(|(label, _)| *label);
-        Some(posterior(self.settings.root.or_else(likeliest)?, &points, None))
+        let mut parts = Parts { surfaces: self.surfaces_in_work(), origins: BTreeMap::new() };
+        let posed = self.reference.iter().rev().flat_map(|frame| &frame.poses);
+        parts.origins = posed.map(|(label, seen)| (*label, seen.world_from_frame.translation)).collect();
+        let likeliest = || parts.surfaces.iter().max_by_key(|(_, points)| points.len()).map(|(label, _)| *label);
+        let root = self.settings.root.or_else(likeliest).or_else(|| parts.origins.keys().next().copied())?;
+        (!parts.surfaces.is_empty() || !parts.origins.is_empty()).then(|| posterior(root, &parts, None))
     }
 
     /// Points of each part's surface at the reference configuration, in the working frame \[m\].
@@ -46,23 +50,33 @@ impl Pipeline {
 impl Learner {
     /// What is believed by what was learned.
     pub(super) fn posterior(&self) -> ObjectPosterior {
-        posterior(self.root, &self.surfaces(), Some(self))
+        let origins = self.posed.iter().map(|(label, part)| (*label, part.world_from_frame.translation)).collect();
+        posterior(self.root, &Parts { surfaces: self.surfaces(), origins }, Some(self))
     }
 
     pub(super) fn surfaces(&self) -> BTreeMap<Label, Vec<Vector3<f64>>> {
+        let seen = self.models.iter().filter(|(label, _)| !self.posed.contains_key(label));
         let surface = |model: &PartModel| model.surfels.iter().map(|s| s.point).collect();
-        self.models.iter().map(|(label, model)| (*label, surface(model))).collect()
+        seen.map(|(label, model)| (*label, surface(model))).collect()
     }
 }
 
-/// `points`: of each part's surface at the reference configuration \[m\].
-fn posterior(
-    root_label: Label,
-    points: &BTreeMap<Label, Vec<Vector3<f64>>>,
-    learner: Option<&Learner>,
-) -> ObjectPosterior {
-    let labels: Vec<Label> = points.keys().copied().collect();
-    let mut parts: Vec<PartPosterior> = points.iter().filter_map(|(label, points)| part(*label, points)).collect();
+/// All parts at the reference configuration \[m\].
+#[derive(Default)]
+struct Parts {
+    /// Points of the surface of those that clouds show.
+    surfaces: BTreeMap<Label, Vec<Vector3<f64>>>,
+    /// Origins of the frames of those that a topic measures.
+    origins: BTreeMap<Label, Vector3<f64>>,
+}
+
+fn posterior(root_label: Label, seen: &Parts, learner: Option<&Learner>) -> ObjectPosterior {
+    let labels: BTreeSet<Label> = seen.surfaces.keys().chain(seen.origins.keys()).copied().collect();
+    let labels: Vec<Label> = labels.into_iter().collect();
+    let mut parts: Vec<PartPosterior> =
+        seen.surfaces.iter().filter_map(|(label, points)| part(*label, points)).collect();
+    parts.extend(seen.origins.iter().map(|(label, origin)| posed_part(*label, origin)));
+    parts.sort_by_key(|part| part.label);
     let dynamics = learner.and_then(Learner::published_dynamics);
     for learned in dynamics.iter().flat_map(|dynamics| &dynamics.parts) {
         if let Some(part) = parts.iter_mut().find(|part| part.label == learned.label) {
@@ -78,6 +92,18 @@ fn posterior(
         edges: edges(root_label, &labels, known),
         windows: learner.map(|learner| learner.records.clone()).unwrap_or_default(),
         criticism: Criticism::insufficient(),
+    }
+}
+
+/// A part of which only a frame is known: its mass and its centre may be anything about it.
+fn posed_part(label: Label, origin: &Vector3<f64>) -> PartPosterior {
+    let (log_sd, center_sd) = (2.5, POSED_RADIUS);
+    let volume = HullProperties::guess(*origin, POSED_RADIUS).volume;
+    PartPosterior {
+        label,
+        com_in_world_m: (*origin).into(),
+        com_covariance_m2: Matrix3::from_diagonal_element(center_sd * center_sd).into(),
+        mass_kg: Quantity::from_log_normal("kg", (HULL_DENSITY.0 * volume).ln(), log_sd, InformedBy::Prior),
     }
 }
 

@@ -24,7 +24,8 @@ impl Learner {
         let inference = self.inferences.last();
         let learned = inference.filter(|inference| inference.failure.is_none() && inference.steps > 0);
         let end = |time: Option<f64>| time.unwrap_or_default();
-        let labels: BTreeSet<Label> = job.contacts.iter().map(|contact| contact.label).collect();
+        let mut labels: BTreeSet<Label> = job.contacts.iter().map(|contact| contact.label).collect();
+        labels.extend(job.wrenches.iter().filter(|wrench| !wrench.tool).filter_map(|wrench| wrench.part));
         self.records.push(WindowRecord {
             t0_s: end(job.frames.first().map(|frame| frame.time_s)),
             t1_s: end(job.frames.last().map(|frame| frame.time_s)),

@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::explain::{FEWEST_POINTS, Frame, grid_of};
+use super::poses::{POSED_RADIUS, PosedPart};
 use super::working_frame::WorkingFrame;
 use super::{Learner, Output, Pipeline, PipelineSettings};
 use crate::math::Pose;
@@ -192,6 +193,8 @@ impl Learner {
             Some((*label, PartModel::grown(first, grown.get(label).unwrap_or(&none))?))
         };
         self.models = self.reference.iter().filter_map(model).collect();
+        let frame = |part: &PosedPart| PartModel::of_frame(part.world_from_frame.translation, POSED_RADIUS);
+        self.models.extend(self.posed.iter().map(|(label, part)| (*label, frame(part))));
     }
 
     /// Finds where the known joints are in a frame, parents first, and with them every part; returns

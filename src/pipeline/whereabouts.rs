@@ -85,6 +85,18 @@ impl Whereabouts {
                 by_joint: if joint.is_some() { 1.0 } else { 0.0 },
                 now: joint.unwrap_or(place),
             };
+            let posed = learner.and_then(|learner| {
+                let pose = learner.posed.get(&label)?.measurement(frame.poses.get(&label)?);
+                Some((learner.models.get(&label)?, pose.displacement))
+            });
+            if let Some((model, pose)) = posed {
+                let poses = self.scan_poses.entry(label).or_default();
+                poses.push((frame.time_s, pose));
+                poses.retain(|(t, _)| frame.time_s - t < KEPT);
+                let free = FreePart::followed(poses, model.centroid, model.radius, &[]);
+                told.insert(label, Told { free, now: joint.unwrap_or(pose), ..unseen });
+                continue;
+            }
             let seen = learner.and_then(|learner| {
                 let (model, scan) = (learner.models.get(&label)?, frame.scans.get(&label)?);
                 (label != learner.root && scan.len() >= FEWEST_POINTS).then_some((learner, model, scan))

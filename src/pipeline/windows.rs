@@ -1,6 +1,6 @@
 //! Frames out of clouds, contacts out of wrenches, windows out of both.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
@@ -10,6 +10,9 @@ use super::learner::WindowJob;
 use crate::model::Contact;
 use crate::registration::ScanPoint;
 use crate::types::{AppliedWrench, Label, SegmentedCloud, Stamp};
+
+/// A torque without force counts as the force that makes it at this lever \[m\].
+const TORQUE_LEVER: f64 = 0.1;
 
 /// When windows open and close.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -98,8 +101,8 @@ pub struct WindowCutter {
     settings: WindowSettings,
     zero: Stamp,
     wrenches: VecDeque<AppliedWrench>,
-    /// Rest reading of the force, while nothing is touched \[N\].
-    pub rest_force: Option<Vector3<f64>>,
+    /// Rest readings by source, while nothing is touched or moves: force \[N\], torque \[N·m\].
+    rest: BTreeMap<usize, [Vector3<f64>; 2]>,
     frames: VecDeque<Frame>,
     open_since: Option<f64>,
     last_contact_s: f64,
@@ -112,7 +115,7 @@ impl WindowCutter {
             settings,
             zero,
             wrenches: VecDeque::new(),
-            rest_force: None,
+            rest: BTreeMap::new(),
             frames: VecDeque::new(),
             open_since: None,
             last_contact_s: f64::NEG_INFINITY,
@@ -133,38 +136,54 @@ impl WindowCutter {
         wrench.stamp.seconds_since(self.zero)
     }
 
-    /// Smoothed force beyond the rest reading at a time \[N\].
-    fn force_at(&self, time_s: f64) -> Option<f64> {
+    /// Rest reading of the force of a tool \[N\].
+    pub fn rest_force(&self) -> Option<Vector3<f64>> {
+        let tool = self.wrenches.iter().find(|wrench| wrench.tool)?;
+        self.rest.get(&tool.source).map(|[force, _]| *force)
+    }
+
+    /// Whether a source is beyond its rest reading at a time, smoothed; `None`: any source. What no tool
+    /// applies may be a torque alone: it counts by its force at [`TORQUE_LEVER`].
+    fn active_at(&self, time_s: f64, source: Option<usize>) -> bool {
         let half = 0.5 * self.settings.smoothing_s;
-        let (mut sum, mut count) = (Vector3::zeros(), 0.0);
-        for wrench in self.wrenches.iter().rev() {
+        let mut sums: BTreeMap<usize, ([Vector3<f64>; 2], f64, bool)> = BTreeMap::new();
+        for wrench in self.wrenches.iter().rev().filter(|w| source.is_none_or(|source| w.source == source)) {
             let t = self.time(wrench);
             if t < time_s - half {
                 break;
             }
             if t <= time_s + half {
-                sum += wrench.force_in_world;
-                count += 1.0;
+                let ([force, torque], count, tool) = sums.entry(wrench.source).or_default();
+                *force += wrench.force_in_world;
+                *torque += wrench.torque_in_world;
+                *count += 1.0;
+                *tool = wrench.tool;
             }
         }
-        (count > 0.0).then(|| (sum / count - self.rest_force.unwrap_or_default()).norm())
+        sums.into_iter().any(|(source, ([force, torque], count, tool))| {
+            let [rest_force, rest_torque] = self.rest.get(&source).copied().unwrap_or_default();
+            let push = (force / count - rest_force).norm();
+            let turn = (torque / count - rest_torque).norm() / TORQUE_LEVER;
+            push > self.settings.force_threshold_n || (!tool && turn > self.settings.force_threshold_n)
+        })
     }
 
     fn track_rest(&mut self, from_s: f64, to_s: f64) {
-        let readings: Vec<Vector3<f64>> = self
-            .wrenches
-            .iter()
-            .filter(|w| {
-                let t = self.time(w);
-                t > from_s && t <= to_s
-            })
-            .map(|w| w.force_in_world)
-            .collect();
-        if readings.is_empty() {
-            return;
+        let mut sums: BTreeMap<usize, ([Vector3<f64>; 2], f64)> = BTreeMap::new();
+        for wrench in &self.wrenches {
+            let t = self.time(wrench);
+            if t > from_s && t <= to_s {
+                let ([force, torque], count) = sums.entry(wrench.source).or_default();
+                *force += wrench.force_in_world;
+                *torque += wrench.torque_in_world;
+                *count += 1.0;
+            }
         }
-        let mean = readings.iter().sum::<Vector3<f64>>() / readings.len() as f64;
-        self.rest_force = Some(self.rest_force.map_or(mean, |rest| rest * 0.9 + mean * 0.1));
+        for (source, (sums, count)) in sums {
+            let mean = sums.map(|sum| sum / count);
+            let rest = self.rest.entry(source).or_insert(mean);
+            *rest = [rest[0] * 0.9 + mean[0] * 0.1, rest[1] * 0.9 + mean[1] * 0.1];
+        }
     }
 
     /// Adds a frame; returns a window that closes with it. `moving`: whether a part still moves.
@@ -176,20 +195,23 @@ impl WindowCutter {
     ) -> Option<WindowJob> {
         let now = frame.time_s;
         let previous = self.frames.back().map_or(now - 0.1, |f| f.time_s);
-        if self.rest_force.is_none() {
+        if self.rest.is_empty() {
             self.track_rest(now - 10.0, now);
         }
         // The newest reading may be younger than the cloud: look only up to the cloud.
         let steps = 4;
         let active = (1..=steps)
             .map(|i| previous + (now - previous) * f64::from(i) / f64::from(steps) - 0.5 * self.settings.smoothing_s)
-            .any(|t| self.force_at(t).is_some_and(|f| f > self.settings.force_threshold_n));
+            .any(|t| self.active_at(t, None));
         if active {
             self.last_contact_s = now;
         }
+        // Registration sees motion where there is none; a measured pose does not.
+        let opens = active || frame.moves;
+        let moving = moving || frame.moves;
         self.frames.push_back(frame);
         match self.open_since {
-            None if active => self.open_since = Some(now),
+            None if opens => self.open_since = Some(now),
             None => {
                 self.track_rest(previous, now);
                 self.forget(now - self.settings.lead_s - 0.2);
@@ -209,6 +231,13 @@ impl WindowCutter {
         self.open_since?;
         let now = self.frames.back()?.time_s;
         Some(self.close(now, nearest))
+    }
+
+    /// Ends a record: a window that is open closes, and what comes is not joined to what was.
+    pub fn end_record(&mut self, nearest: impl Fn(&Vector3<f64>, &Frame) -> Option<Label>) -> Option<WindowJob> {
+        let job = self.flush(nearest);
+        self.frames.clear();
+        job
     }
 
     fn forget(&mut self, before_s: f64) {
@@ -232,19 +261,24 @@ impl WindowCutter {
         WindowJob { frames, contacts, wrenches, zero: self.zero }
     }
 
-    /// The tool's contacts, by the part that the tool was nearest to.
+    /// Each tool's contact, by the part that it was nearest to.
     fn contacts(&self, frames: &[Frame], nearest: impl Fn(&Vector3<f64>, &Frame) -> Option<Label>) -> Vec<Contact> {
-        let active: Vec<bool> = frames
-            .iter()
-            .map(|f| self.force_at(f.time_s).is_some_and(|force| force > self.settings.force_threshold_n))
-            .collect();
-        let (Some(first), Some(last)) = (active.iter().position(|a| *a), active.iter().rposition(|a| *a)) else {
-            return Vec::new();
-        };
+        let tools: BTreeSet<usize> = self.wrenches.iter().filter(|w| w.tool).map(|w| w.source).collect();
+        tools.into_iter().filter_map(|source| self.contact_of(source, frames, &nearest)).collect()
+    }
+
+    fn contact_of(
+        &self,
+        source: usize,
+        frames: &[Frame],
+        nearest: impl Fn(&Vector3<f64>, &Frame) -> Option<Label>,
+    ) -> Option<Contact> {
+        let active: Vec<bool> = frames.iter().map(|f| self.active_at(f.time_s, Some(source))).collect();
+        let (first, last) = (active.iter().position(|a| *a)?, active.iter().rposition(|a| *a)?);
         let mut track = Vec::new();
         let mut votes: BTreeMap<Label, usize> = BTreeMap::new();
         for k in first..=last {
-            if let Some((position, sigma)) = self.tool_at(frames[k].time_s) {
+            if let Some((position, sigma)) = self.tool_at(source, frames[k].time_s) {
                 track.push((k, position, sigma));
                 if active[k]
                     && let Some(label) = nearest(&position, &frames[k])
@@ -253,17 +287,17 @@ impl WindowCutter {
                 }
             }
         }
-        let bound = self.wrenches.iter().find_map(|w| w.part);
-        let label = bound.or_else(|| votes.iter().max_by_key(|(_, n)| **n).map(|(l, _)| *l));
-        label.map(|label| Contact { label, track }).into_iter().collect()
+        let bound = self.wrenches.iter().find(|w| w.source == source).and_then(|w| w.part);
+        let label = bound.or_else(|| votes.iter().max_by_key(|(_, n)| **n).map(|(l, _)| *l))?;
+        Some(Contact { label, track })
     }
 
     /// The tool's position at a time, by a local quadratic fit, with its standard deviation \[m\].
-    fn tool_at(&self, time_s: f64) -> Option<(Vector3<f64>, f64)> {
+    fn tool_at(&self, source: usize, time_s: f64) -> Option<(Vector3<f64>, f64)> {
         let mut matrix = nalgebra::Matrix3::zeros();
         let mut right = nalgebra::Matrix3::zeros();
         let mut samples = Vec::new();
-        for wrench in &self.wrenches {
+        for wrench in self.wrenches.iter().filter(|w| w.source == source) {
             let t = (self.time(wrench) - time_s) / 0.05;
             if t.abs() <= 1.0 {
                 let row = Vector3::new(1.0, t, t * t);

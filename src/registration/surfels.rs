@@ -296,6 +296,11 @@ impl PartModel {
         Self { centroid, radius, ..Self::of([reference, grown].concat()) }
     }
 
+    /// A part of which only a frame's pose is measured: nothing to register, \[m\].
+    pub fn of_frame(origin: Vector3<f64>, radius: f64) -> Self {
+        Self { surfels: Vec::new(), centroid: origin, radius, field: NearestField::new(&[]) }
+    }
+
     fn of(surfels: Vec<Surfel>) -> Self {
         let count = surfels.len().max(1) as f64;
         let centroid = surfels.iter().map(|s| s.point).sum::<Vector3<f64>>() / count;

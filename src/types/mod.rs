@@ -68,8 +68,11 @@ pub struct AppliedWrench {
     pub stamp: Stamp,
     /// Which wrench topic it came from, from 0.
     pub source: usize,
-    /// The part it acts on, where configuration binds the topic to one; otherwise found by contact.
+    /// The part it acts on, where the topic is bound to one; otherwise found by contact.
     pub part: Option<Label>,
+    /// Whether a tool applies it, which moves with what it holds. If not, it acts on `part` whenever it
+    /// is reported, as the torque of a motor does, and its point says nothing of the part's motion.
+    pub tool: bool,
     /// Origin of the sensor's frame, in world \[m\].
     pub point_in_world: Vector3<f64>,
     /// Force on the object, in world \[N\].

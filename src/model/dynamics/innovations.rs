@@ -16,7 +16,7 @@ use super::layout::Mechanism;
 use super::track::{CONTACT_DEVIATION, JointTrack, Observation};
 use crate::inference::Failure;
 use crate::math::Real;
-use crate::mechanism::{State, Tree, WrenchSample, WrenchTrack, rollout};
+use crate::mechanism::{Spatial, State, Tree, WrenchSample, WrenchTrack, rollout};
 use crate::model::Axis;
 
 /// Longest step of the simulation \[s\]: half a wrench sample; trajectories of the midpoint step
@@ -31,6 +31,8 @@ const FRICTION_SPAN_S: f64 = 0.02;
 /// Standard deviation of the first position \[m or rad\] and rate \[m/s or rad/s\].
 const FIRST_POSITION: f64 = 0.02;
 const FIRST_RATE: f64 = 0.1;
+/// The same of a rate that the window opens with, in shares of it.
+const FIRST_RATE_SHARE: f64 = 0.1;
 /// Components of the contact point's error, after (q, q̇).
 const CONTACT: usize = 3;
 
@@ -115,7 +117,7 @@ impl WindowModel<'_> {
         let mut slopes = DMatrix::zeros(size, p);
         let deviation = |i: usize| match i {
             i if i < n => FIRST_POSITION,
-            i if i < 2 * n => FIRST_RATE,
+            i if i < 2 * n => FIRST_RATE.hypot(FIRST_RATE_SHARE * state[i]),
             _ => CONTACT_DEVIATION,
         };
         let mut covariance = DMatrix::from_fn(size, size, |i, j| if i == j { deviation(i).powi(2) } else { 0.0 });
@@ -270,11 +272,11 @@ impl WindowModel<'_> {
             positions[joint] = state[i];
             rates[joint] = state[n + i];
         }
-        let samples = within(&self.track.samples, span);
-        let track = self.track.touched.map(|body| WrenchTrack::new(body, samples));
+        let tracks: Vec<WrenchTrack<'_, T>> =
+            self.track.drives.iter().map(|d| WrenchTrack::new(d.joint, within(&d.samples, span))).collect();
         let step_s = if n > 1 { CHAIN_STEP_S } else { STEP_S };
-        let run = rollout(tree, &State::new(positions, rates), track.as_slice(), &span, step_s)
-            .map_err(|_| Failure::Diverged)?;
+        let run =
+            rollout(tree, &State::new(positions, rates), &tracks, &span, step_s).map_err(|_| Failure::Diverged)?;
         let (positions, rates) = (run.positions(1), run.rates(1));
         Ok(self.moving.iter().map(|&j| positions[j]).chain(self.moving.iter().map(|&j| rates[j])).collect())
     }
@@ -302,8 +304,18 @@ impl WindowModel<'_> {
             }
             let step = self.track.positions[ahead][i - n] - first[i - n];
             // Positions of a joint at rest are equal, as the kinematic fit ties them.
-            if step.abs() > 0.02 && span_s > 0.0 { step / span_s } else { 0.0 }
+            if step.abs() > 0.02 && span_s > 0.0 { self.first_rate(i - n, ahead) } else { 0.0 }
         })
+    }
+
+    /// Slope at the first observation of the parabola through it, the one `ahead` of it and the middle one.
+    fn first_rate(&self, i: usize, ahead: usize) -> f64 {
+        let point = |k: usize| {
+            let span_s = self.track.observations[k].time_s - self.track.observations[0].time_s;
+            (span_s, self.track.positions[k][i] - self.track.positions[0][i])
+        };
+        let ((t1, x1), (t2, x2)) = (point(ahead.div_ceil(2)), point(ahead));
+        if t1 > 0.0 && t2 > t1 { (x1 * t2 / t1 - x2 * t1 / t2) / (t2 - t1) } else { x2 / t2 }
     }
 }
 
@@ -347,23 +359,25 @@ impl ProcessNoise {
     /// Covariance that (q, q̇) gather over a span.
     fn over(&self, span: [f64; 2], q: &[f64], model: &WindowModel<'_>) -> Result<DMatrix<f64>, Failure> {
         let n = model.moving.len();
-        let track = model.track;
         let mut density = DMatrix::from_fn(n, n, |i, j| if i == j { self.floor[i] } else { 0.0 });
-        let sample = within(&track.samples, span).first();
-        if let (Some(sample), Some(touched)) = (sample, track.touched) {
-            let screws = self.tree.screws(q);
-            let mut levers = vec![nalgebra::Vector3::zeros(); n];
-            let mut at = Some(touched);
+        let screws = self.tree.screws(q);
+        for drive in &model.track.drives {
+            let Some(sample) = within(&drive.samples, span).first() else { continue };
+            let mut levers = vec![[nalgebra::Vector3::zeros(); 2]; n];
+            let mut at = Some(drive.joint);
             while let Some(joint) = at {
                 if let Some(i) = model.moving.iter().position(|&m| m == joint) {
-                    levers[i] = screws[joint].angular.cross(&sample.point_in_world) + screws[joint].linear;
+                    let Spatial { angular, linear } = screws[joint];
+                    levers[i] = [angular.cross(&sample.point_in_world) + linear, angular];
                 }
                 at = model.mechanism.joints[joint].joint.parent;
             }
-            let variance = track.force_deviation.powi(2) * track.sample_span_s;
-            for i in 0..n {
-                for j in 0..n {
-                    density[(i, j)] += variance * levers[i].dot(&levers[j]);
+            for (kind, deviation) in [drive.force_deviation, drive.torque_deviation].into_iter().enumerate() {
+                let variance = deviation.powi(2) * drive.sample_span_s;
+                for i in 0..n {
+                    for j in 0..n {
+                        density[(i, j)] += variance * levers[i][kind].dot(&levers[j][kind]);
+                    }
                 }
             }
         }

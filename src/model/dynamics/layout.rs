@@ -43,6 +43,9 @@ const LOG_SHAPE_DEVIATION: f64 = 0.35;
 /// Standard deviation of the centre of mass, in spreads of the part's points: a uniform panel's
 /// spread is .29 of its extent, so this is 15 % of the extent.
 const CENTER_DEVIATION: f64 = 0.5;
+/// The same of a part whose surface nobody saw: anything from grams to hundreds of kilograms, of any
+/// shape, its centre a link's length from the measured frame \[m\].
+const GUESS_DEVIATIONS: (f64, f64, f64) = (2.5, 1.5, 0.1);
 /// Standard deviation of ln damping and ln friction about the scales of the first window.
 const LOG_FORCE_DEVIATION: f64 = 1.5;
 /// Standard deviation of an end stop about where the joint was seen to halt \[m or rad\].
@@ -131,11 +134,13 @@ impl JointModel {
         map[(DAMPING, DAMPING)] = LOG_FORCE_DEVIATION;
         map[(FRICTION, FRICTION)] = LOG_FORCE_DEVIATION;
         let mass = DENSITY * self.hull.volume;
+        let guess = self.hull.is_guess().then_some(GUESS_DEVIATIONS);
+        let (density, shape, _) = guess.unwrap_or((LOG_DENSITY_DEVIATION, LOG_SHAPE_DEVIATION, 0.0));
         mean[MASS] = mass.ln();
-        map[(MASS, MASS)] = LOG_DENSITY_DEVIATION;
+        map[(MASS, MASS)] = density;
         mean[INERTIA] = (mass * self.inertia_per_mass()).ln();
-        map[(INERTIA, MASS)] = LOG_DENSITY_DEVIATION;
-        map[(INERTIA, INERTIA)] = LOG_SHAPE_DEVIATION;
+        map[(INERTIA, MASS)] = density;
+        map[(INERTIA, INERTIA)] = shape;
         for (i, (place, position)) in [LOWER, UPPER].into_iter().zip(seen).enumerate() {
             mean[place] = position;
             map[(place, place)] = if self.stops[i] { LIMIT_DEVIATION } else { 1.0 };
@@ -145,7 +150,7 @@ impl JointModel {
             let revolute = self.joint.joint_type == JointType::Revolute;
             mean[CENTER + i] = if revolute { offset.dot(basis) } else { 0.0 };
             let spread = self.hull.spread.dot(&basis.abs()).max(0.01);
-            map[(CENTER + i, CENTER + i)] = CENTER_DEVIATION * spread;
+            map[(CENTER + i, CENTER + i)] = guess.map_or(CENTER_DEVIATION * spread, |(_, _, center)| center);
         }
         Gaussian::from_moments(&mean, &(&map * map.transpose()))
     }

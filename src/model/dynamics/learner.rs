@@ -7,11 +7,11 @@ use serde::{Deserialize, Serialize};
 
 use super::layout::{JointScales, LIMIT_DEVIATION, LOWER, Mechanism, UPPER, joint_models};
 use super::site::{FittedWindow, WindowFit, inertial_entries, load_factor};
-use super::track::{TrackKinematics, TrackSource, joint_track, touched_label};
+use super::track::{Drive, TrackKinematics, TrackSource, driven_labels, joint_track, touched_label};
 use crate::geometry::HullProperties;
 use crate::inference::{Belief, Factor, Failure, Gaussian, Joint};
 use crate::math::orthonormal_pair;
-use crate::mechanism::JointType;
+use crate::mechanism::{JointType, WrenchTrack};
 use crate::model::{Axis, Contact, KinematicFit, KinematicJoint, WindowObservations};
 use crate::types::{Label, Stamp};
 
@@ -21,6 +21,8 @@ const REST_ANGLE: f64 = 0.015;
 /// Linearizations for one window at most, and for all revisits after a window.
 const STEPS: usize = 14;
 const REVISIT_STEPS: usize = 12;
+/// A joint that stops at an end of its range stays there as long \[s\].
+const SHORTEST_HALT: f64 = 0.1;
 /// A stop is believed if it raises the log evidence by this.
 const STOP_EVIDENCE: f64 = 4.0;
 
@@ -258,7 +260,11 @@ impl DynamicsLearner {
         let default = JointScales { force: 1.0, rate: 0.2 };
         let scales: Vec<_> = fit.joints.iter().map(|j| memory(j).and_then(|m| m.scales).unwrap_or(default)).collect();
         let stops: Vec<_> = fit.joints.iter().map(|j| memory(j).map_or([false; 2], |m| m.stops)).collect();
-        let hull = |joint: &KinematicJoint| memory(joint).and_then(|m| m.hull.clone()).unwrap_or_else(|| ball(joint));
+        let hull = |joint: &KinematicJoint| {
+            memory(joint)
+                .and_then(|m| m.hull.clone())
+                .unwrap_or_else(|| HullProperties::guess(joint.center, joint.radius.max(0.05)))
+        };
         let mut models = joint_models(&fit.joints, hull, &scales, &stops, &self.gravity);
         for model in &mut models {
             let label = model.joint.child;
@@ -344,23 +350,29 @@ impl DynamicsLearner {
     }
 
     /// Which joints move in a window, and where the others rest.
-    /// Joints in another branch than the touched part's are left out: nothing known drives them.
-    pub(super) fn moving(&self, window: usize, fit: &KinematicFit) -> (Vec<usize>, Vec<Option<f64>>) {
+    /// Joints in branches that no wrench acts on are left out: nothing known drives them.
+    pub(super) fn moving(
+        &self,
+        window: usize,
+        fit: &KinematicFit,
+        input: &DynamicsInput<'_>,
+    ) -> (Vec<usize>, Vec<Option<f64>>) {
         let root = |mut k: usize| {
             while let Some(p) = fit.joints[k].parent {
                 k = p;
             }
             k
         };
-        let touched = touched_label(&self.windows[window].contacts);
-        let branch = touched.and_then(|label| fit.joints.iter().position(|j| j.child == label)).map(root);
+        let driven = driven_labels(&self.windows[window].contacts, input.windows[window]);
+        let joint_of = |label| fit.joints.iter().position(|j| j.child == label);
+        let branches: Vec<usize> = driven.into_iter().filter_map(joint_of).map(root).collect();
         let mut moving = Vec::new();
         let mut frozen = vec![None; fit.joints.len()];
         for (k, joint) in fit.joints.iter().enumerate() {
             let positions = &fit.positions[window][k];
             let (low, high) = range(positions);
             let rest = if joint.joint_type == JointType::Revolute { REST_ANGLE } else { REST };
-            if high - low > rest && branch == Some(root(k)) {
+            if high - low > rest && branches.contains(&root(k)) {
                 moving.push(k);
             } else {
                 frozen[k] = Some(positions.iter().sum::<f64>() / positions.len().max(1) as f64);
@@ -392,7 +404,7 @@ impl DynamicsLearner {
     fn first_scales(&self, joint: usize, fit: &KinematicFit, input: &DynamicsInput<'_>) -> Option<JointScales> {
         let kinematics = kinematics_of(fit);
         (0..input.windows.len()).find_map(|w| {
-            let (moving, _) = self.moving(w, fit);
+            let (moving, _) = self.moving(w, fit, input);
             let column = moving.iter().position(|&m| m == joint)?;
             let track = joint_track(&self.source(w, &moving, fit, input), &kinematics)?;
             let times = &input.windows[w].times_s;
@@ -410,24 +422,21 @@ impl DynamicsLearner {
 
     /// |Sᵀ w| of the samples on a joint, at the reference configuration of its ancestors.
     fn generalized_forces(&self, joint: usize, fit: &KinematicFit, track: &super::track::JointTrack) -> Vec<f64> {
-        let mut above = track.touched;
-        while above.is_some_and(|k| k != joint) {
-            above = above.and_then(|k| fit.joints[k].parent);
-        }
-        if above.is_none() {
-            return Vec::new();
-        }
+        let carries =
+            |drive: &&Drive| std::iter::successors(Some(drive.joint), |&k| fit.joints[k].parent).any(|k| k == joint);
+        let acting: Vec<&Drive> = track.drives.iter().filter(carries).collect();
+        let Some(first) = acting.iter().max_by_key(|drive| drive.samples.len()) else { return Vec::new() };
         let screw = fit.joints[joint].screw().0;
         let (angular, linear) = (screw.fixed_rows::<3>(0), screw.fixed_rows::<3>(3));
-        track
-            .samples
-            .iter()
-            .map(|s| {
-                let moment = s.torque_in_world + s.point_in_world.cross(&s.force_in_world);
-                (angular.dot(&moment) + linear.dot(&s.force_in_world)).abs()
-            })
-            .filter(|f| *f > 0.0)
-            .collect()
+        let mut cursors = vec![0; acting.len()];
+        let mut force = |time_s: f64| -> f64 {
+            let at = |(drive, cursor): (&&Drive, &mut usize)| {
+                let wrench = WrenchTrack::<f64>::new(drive.joint, &drive.samples).wrench(time_s, cursor);
+                angular.dot(&wrench.torque) + linear.dot(&wrench.force)
+            };
+            acting.iter().zip(&mut cursors).map(at).sum::<f64>().abs()
+        };
+        first.samples.iter().map(|s| force(s.stamp_s)).filter(|f| *f > 0.0).collect()
     }
 
     /// Learns one window against its cavity.
@@ -438,14 +447,14 @@ impl DynamicsLearner {
         input: &DynamicsInput<'_>,
         steps: usize,
     ) -> Result<WindowInference, Failure> {
-        let (moving, frozen) = self.moving(window, fit);
+        let (moving, frozen) = self.moving(window, fit, input);
         if moving.is_empty() {
             return self.learn_rest(window, fit, input);
         }
         let mut fitted = self.fit_window(window, fit, input, &moving, &frozen, (steps, None))?;
         let mut spent = fitted.1.steps;
         // Stops where the joint arrived at the end of its range.
-        let halts = if self.windows[window].learned { Vec::new() } else { self.halts(window, fit, &moving) };
+        let halts = if self.windows[window].learned { Vec::new() } else { self.halts(window, fit, &moving, input) };
         for (joint, side, position) in halts {
             let label = fit.joints[joint].child;
             let before = self.joints.get(&label).cloned();
@@ -496,7 +505,7 @@ impl DynamicsLearner {
     ) -> Result<WindowInference, Failure> {
         let track =
             joint_track(&self.source(window, &[0], fit, input), &kinematics_of(fit)).ok_or(Failure::NoInformation)?;
-        let touched = track.touched.ok_or(Failure::NoInformation)?;
+        let touched = track.drives.first().ok_or(Failure::NoInformation)?.joint;
         let label = fit.joints[touched].child;
         // The load that stood for a tenth of the contact: not a spike of noise.
         let load = quantile(self.generalized_forces(touched, fit, &track), 0.9).ok_or(Failure::NoInformation)?;
@@ -510,7 +519,13 @@ impl DynamicsLearner {
     }
 
     /// The (joint, side, position) where a joint arrived at an end of all its positions so far.
-    fn halts(&self, window: usize, fit: &KinematicFit, moving: &[usize]) -> Vec<(usize, usize, f64)> {
+    fn halts(
+        &self,
+        window: usize,
+        fit: &KinematicFit,
+        moving: &[usize],
+        input: &DynamicsInput<'_>,
+    ) -> Vec<(usize, usize, f64)> {
         let mut halts = Vec::new();
         for &k in moving {
             let joint = &fit.joints[k];
@@ -528,7 +543,13 @@ impl DynamicsLearner {
                 let positions = &fit.positions[window][k];
                 let at_end = |i: usize| (positions[i] - end).abs() < near;
                 let arrival = (1..positions.len()).find(|&i| at_end(i) && !at_end(i - 1));
-                if arrival.is_some_and(|i| (i..positions.len()).take_while(|&i| at_end(i)).count() >= 2) {
+                let times_s = &input.windows[window].times_s;
+                // A swing turns round in less.
+                let stays = |from: usize| {
+                    let last = (from..positions.len()).take_while(|&i| at_end(i)).last();
+                    last.is_some_and(|last| times_s[last] - times_s[from] > 0.9 * SHORTEST_HALT)
+                };
+                if arrival.is_some_and(stays) {
                     halts.push((k, side, end));
                 }
             }
@@ -762,20 +783,6 @@ fn with_stops(prior: &Gaussian, memory: &JointMemory) -> Gaussian {
         gaussian.information[place] = memory.stop_positions[side] * deviation.powi(-2);
     }
     gaussian
-}
-
-/// A hull for a part of which no cloud is known.
-fn ball(joint: &KinematicJoint) -> HullProperties {
-    let r = joint.radius.max(0.05);
-    let volume = 4.19 * r * r * r;
-    HullProperties {
-        volume,
-        center: joint.center,
-        inertia_per_density: nalgebra::Matrix3::identity() * (0.4 * volume * r * r),
-        spread: Vector3::repeat(r / 5f64.sqrt()),
-        vertices: Vec::new(),
-        triangles: Vec::new(),
-    }
 }
 
 fn range(values: &[f64]) -> (f64, f64) {

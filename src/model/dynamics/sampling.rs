@@ -103,7 +103,8 @@ impl DynamicsLearner {
         let joint = self.belief.product(None);
         let blocks = self.blocks();
         let conditional = given_kinematics(&joint, &blocks)?;
-        let moving: Vec<_> = (0..input.windows.len().min(self.windows.len())).map(|w| self.moving(w, fit)).collect();
+        let moving: Vec<_> =
+            (0..input.windows.len().min(self.windows.len())).map(|w| self.moving(w, fit, input)).collect();
         let mut density = DynamicsDensity { rest: joint.gaussian.clone(), windows: Vec::new() };
         for (index, (moving, frozen)) in moving.iter().enumerate() {
             let memory = &self.windows[index];

@@ -138,6 +138,7 @@ impl Truth {
             let target = self.displacements(&wanted)[self.touched].transform_point(&self.contact);
             let force = (target - at) * 150.0 + hold;
             wrenches.push(AppliedWrench {
+                tool: true,
                 stamp: Stamp((t * 1e9) as i64),
                 source: 0,
                 part: None,

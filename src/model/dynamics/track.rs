@@ -1,4 +1,4 @@
-//! What a window measured of its joints' positions, in joint space, and the wrench that acted.
+//! What a window measured of its joints' positions, in joint space, and the wrenches that acted.
 //!
 //! Tool positions x in bins of 40 ms and part poses are linearized about the joint positions that
 //! explain them best: each observation is H q with unit noise. Given the axes and the tool's offset
@@ -7,12 +7,14 @@
 //! and they err by their own: its error is one unknown of the window, so that the tool measures
 //! motion, and not where zero is.
 
+use std::collections::BTreeSet;
+
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
 
 use crate::math::Pose;
 use crate::mechanism::WrenchSample;
 use crate::model::{Axis, Contact, KinematicJoint, WindowObservations};
-use crate::types::{Label, Stamp};
+use crate::types::{AppliedWrench, Label, Stamp};
 
 /// Span of tool positions that make one observation \[s\].
 const BIN_S: f64 = 0.04;
@@ -79,14 +81,40 @@ pub struct JointTrack {
     pub observations: Vec<Observation>,
     /// Smoothed positions of the moving joints at the observations.
     pub positions: Vec<DVector<f64>>,
-    /// The wrench on the contact's part at the true contact x − o; zero without contact.
+    /// All wrenches that acted on the joints' children.
+    pub drives: Vec<Drive>,
+}
+
+/// One wrench over a window: of a tool, at the true contact x − o and zero without contact, or of what
+/// else acts on a part.
+#[derive(Clone, Debug)]
+pub struct Drive {
+    /// The joint whose child it acts on.
+    pub joint: usize,
+    /// Readings in order of time.
     pub samples: Vec<WrenchSample>,
-    /// The joint whose child is touched.
-    pub touched: Option<usize>,
-    /// Standard deviation of one force reading \[N\].
+    /// Standard deviation of one force reading, per axis \[N\].
     pub force_deviation: f64,
-    /// Span between two force readings \[s\].
+    /// Standard deviation of one torque reading, per axis \[N·m\].
+    pub torque_deviation: f64,
+    /// Span between two readings \[s\].
     pub sample_span_s: f64,
+}
+
+impl Drive {
+    fn new(joint: usize, samples: Vec<WrenchSample>) -> Self {
+        let readings = |of: fn(&WrenchSample) -> Vector3<f64>| -> Vec<(f64, Vector3<f64>)> {
+            samples.iter().map(|s| (s.stamp_s, of(s))).collect()
+        };
+        let span_s = samples.last().map_or(0.0, |l| l.stamp_s - samples[0].stamp_s);
+        Self {
+            joint,
+            force_deviation: local_deviation(&readings(|s| s.force_in_world)),
+            torque_deviation: local_deviation(&readings(|s| s.torque_in_world)),
+            sample_span_s: span_s / (samples.len().max(2) - 1) as f64,
+            samples,
+        }
+    }
 }
 
 impl TrackSource<'_> {
@@ -123,16 +151,39 @@ impl TrackSource<'_> {
         self.positions.iter().map(|p| p[after - 1] + weight * (p[after] - p[after - 1])).collect()
     }
 
-    fn contact(&self) -> Option<(usize, &Contact, Option<Vector3<f64>>)> {
-        let (index, contact) = self.contacts.iter().enumerate().find(|(_, c)| !c.track.is_empty())?;
-        let joint = self.joints.iter().position(|j| j.child == contact.label)?;
-        Some((joint, contact, self.contact_points.get(index).copied()))
+    /// The contacts with the joints' children: joint, span \[s\], contact and its point, if fitted.
+    fn touches(&self) -> Vec<Touch> {
+        let touch = |(index, contact): (usize, &'_ Contact)| {
+            let joint = self.joints.iter().position(|j| j.child == contact.label)?;
+            let (time, point) =
+                (|k: usize| self.window.times_s.get(k).copied(), self.contact_points.get(index).copied());
+            let span_s = (time(contact.track.first()?.0)?, time(contact.track.last()?.0)?);
+            let mean = contact.track.iter().map(|(_, x, _)| x).sum::<Vector3<f64>>() / contact.track.len() as f64;
+            Some(Touch { joint, label: contact.label, span_s, point, mean })
+        };
+        self.contacts.iter().enumerate().filter_map(touch).collect()
     }
+}
 
-    fn contact_span(&self, contact: &Contact) -> Option<(f64, f64)> {
-        let time =
-            |t: Option<&(usize, Vector3<f64>, f64)>| t.and_then(|(k, _, _)| self.window.times_s.get(*k)).copied();
-        Some((time(contact.track.first())?, time(contact.track.last())?))
+/// A tool's contact with a joint's child.
+struct Touch {
+    joint: usize,
+    label: Label,
+    span_s: (f64, f64),
+    /// The contact point at the reference configuration, if fitted \[m\].
+    point: Option<Vector3<f64>>,
+    /// Mean place of the tool \[m\].
+    mean: Vector3<f64>,
+}
+
+/// Which contact a tool's reading belongs to: that of the part it is bound to, else the nearest.
+fn contact_of(touches: &[Touch], reading: &AppliedWrench) -> Option<usize> {
+    match reading.part {
+        Some(part) => touches.iter().position(|touch| touch.label == part),
+        None => {
+            let away = |touch: &Touch| (touch.mean - reading.point_in_world).norm();
+            (0..touches.len()).min_by(|&a, &b| away(&touches[a]).total_cmp(&away(&touches[b])))
+        }
     }
 }
 
@@ -144,31 +195,43 @@ pub fn joint_track(source: &TrackSource<'_>, kinematics: &TrackKinematics) -> Op
         return None;
     }
     let (begin_s, end_s) = (times[0], times[times.len() - 1]);
-    let seconds = |w: &crate::types::AppliedWrench| w.stamp.seconds_since(source.zero);
-    let readings: Vec<_> =
+    let seconds = |w: &AppliedWrench| w.stamp.seconds_since(source.zero);
+    let readings: Vec<&AppliedWrench> =
         source.window.wrenches.iter().filter(|w| (begin_s - 0.1..=end_s + 0.1).contains(&seconds(w))).collect();
-    let touching =
-        source.contact().and_then(|(joint, contact, point)| Some((joint, source.contact_span(contact)?, point)));
-    let samples: Vec<WrenchSample> = touching.map_or_else(Vec::new, |(_, (from_s, to_s), _)| {
-        readings
-            .iter()
-            .filter(|w| (from_s - CONTACT_MARGIN_S..=to_s + CONTACT_MARGIN_S).contains(&seconds(w)))
-            .map(|w| WrenchSample {
-                stamp_s: seconds(w),
-                point_in_world: w.point_in_world - kinematics.tool_offset,
-                force_in_world: w.force_in_world,
-                torque_in_world: w.torque_in_world,
-            })
-            .collect()
-    });
+    let sample = |w: &AppliedWrench, offset: Vector3<f64>| WrenchSample {
+        stamp_s: seconds(w),
+        point_in_world: w.point_in_world - offset,
+        force_in_world: w.force_in_world,
+        torque_in_world: w.torque_in_world,
+    };
+    let touches = source.touches();
+    let mut drives = Vec::new();
     let mut located: Vec<(f64, Located)> = frame_information(source, kinematics);
-    if let Some((joint, span, point)) = touching.filter(|_| source.use_tool) {
-        let tool: Vec<(f64, Vector3<f64>)> = readings
-            .iter()
-            .map(|w| (seconds(w), w.point_in_world))
-            .filter(|(t, _)| *t >= span.0 && *t <= span.1)
-            .collect();
-        located.extend(tool_information(source, kinematics, joint, point, &tool));
+    for (index, touch) in touches.iter().enumerate() {
+        let own: Vec<&AppliedWrench> =
+            readings.iter().copied().filter(|w| w.tool && contact_of(&touches, w) == Some(index)).collect();
+        let (from_s, to_s) = touch.span_s;
+        let in_contact =
+            |w: &&&AppliedWrench| (from_s - CONTACT_MARGIN_S..=to_s + CONTACT_MARGIN_S).contains(&seconds(w));
+        let samples = own.iter().filter(in_contact).map(|w| sample(w, kinematics.tool_offset)).collect();
+        let drive = Drive::new(touch.joint, samples);
+        // What its torque's noise does to the joints is next to nothing beside what its force's does.
+        drives.push(Drive { samples: with_ends(drive.samples), torque_deviation: 0.0, ..drive });
+        if source.use_tool {
+            let tool: Vec<(f64, Vector3<f64>)> = own
+                .iter()
+                .map(|w| (seconds(w), w.point_in_world))
+                .filter(|(t, _)| *t >= from_s && *t <= to_s)
+                .collect();
+            located.extend(tool_information(source, kinematics, touch.joint, touch.point, &tool));
+        }
+    }
+    for (joint, child) in source.joints.iter().map(|j| j.child).enumerate() {
+        let acting = |w: &&&AppliedWrench| !w.tool && w.part == Some(child);
+        let samples: Vec<WrenchSample> = readings.iter().filter(acting).map(|w| sample(w, Vector3::zeros())).collect();
+        if !samples.is_empty() {
+            drives.push(Drive::new(joint, samples));
+        }
     }
     located.sort_by(|a, b| a.0.total_cmp(&b.0));
     let mut observations: Vec<Observation> = Vec::with_capacity(located.len());
@@ -179,16 +242,7 @@ pub fn joint_track(source: &TrackSource<'_>, kinematics: &TrackKinematics) -> Op
             positions.push(located.position);
         }
     }
-    let forces: Vec<(f64, Vector3<f64>)> = samples.iter().map(|s| (s.stamp_s, s.force_in_world)).collect();
-    let span_s = samples.last().map_or(0.0, |l| l.stamp_s - samples[0].stamp_s);
-    Some(JointTrack {
-        observations,
-        positions,
-        touched: touching.map(|(joint, _, _)| joint),
-        force_deviation: local_deviation(&forces),
-        sample_span_s: span_s / (samples.len().max(2) - 1) as f64,
-        samples: with_ends(samples),
-    })
+    Some(JointTrack { observations, positions, drives })
 }
 
 /// Lets the force be zero outside of the contact.
@@ -359,13 +413,12 @@ fn frame_information(source: &TrackSource<'_>, kinematics: &TrackKinematics) -> 
                 }
                 let here = place(joint, &all[k][j]);
                 let sharing = all.iter().filter(|d| (place(joint, &d[j]) - here).norm() < SHARED_DISTANCE).count();
-                let information = shared(&measured.information, joint.radius, sharing as f64);
-                let residual = (Pose::from_translation(-joint.center)
-                    * measured.displacement.inverse()
-                    * all[k][j]
-                    * Pose::from_translation(joint.center))
-                .log();
-                let weight = (STUDENT_FREEDOM + 6.0) / (STUDENT_FREEDOM + residual.dot(&(information * residual)));
+                let raw = measured.information;
+                let direct = source.window.direct.contains_key(&joint.child);
+                let information = if direct { raw } else { shared(&raw, joint.radius, sharing as f64) };
+                let (residual, information) = measured.compare(&information, &joint.center, &all[k][j]);
+                let weight = (STUDENT_FREEDOM + measured.dimensions())
+                    / (STUDENT_FREEDOM + residual.dot(&(information * residual)));
                 let into_body = (Pose::from_translation(-joint.center) * all[k][j].inverse()).adjoint_matrix();
                 let columns: Vec<Vector6<f64>> = twists.iter().map(|t| into_body * t).collect();
                 for a in 0..n {
@@ -402,4 +455,10 @@ fn shared(raw: &Matrix6<f64>, radius: f64, sharing: f64) -> Matrix6<f64> {
 /// The touched label of a window's contacts, if any.
 pub fn touched_label(contacts: &[Contact]) -> Option<Label> {
     contacts.iter().find(|c| !c.track.is_empty()).map(|c| c.label)
+}
+
+/// The parts that a wrench acts on in a window.
+pub fn driven_labels(contacts: &[Contact], window: &WindowObservations) -> BTreeSet<Label> {
+    let touched = contacts.iter().filter(|c| !c.track.is_empty()).map(|c| c.label);
+    touched.chain(window.wrenches.iter().filter(|w| !w.tool).filter_map(|w| w.part)).collect()
 }
