@@ -423,7 +423,10 @@ fn documentation(text: &str) -> BTreeMap<String, String> {
             path.retain(|(depth, _)| *depth < indent);
             path.push((indent, key.to_owned()));
             let name: Vec<&str> = path.iter().map(|(_, key)| key.as_str()).collect();
-            found.insert(name.join("."), comment.join(" "));
+            // A key without a comment is told of with those above it.
+            let above = found.get(&name[..name.len() - 1].join(".")).cloned().unwrap_or_default();
+            let text = if comment.is_empty() { above } else { comment.join(" ") };
+            found.insert(name.join("."), text);
             comment.clear();
         } else {
             comment.clear();
