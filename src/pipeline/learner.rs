@@ -69,8 +69,8 @@ pub struct Learner {
     pub use_tool: bool,
     /// Reference models.
     pub models: BTreeMap<Label, PartModel>,
-    /// Surfels of the first look.
-    reference: BTreeMap<Label, Vec<Surfel>>,
+    /// Models of the first look.
+    reference: BTreeMap<Label, PartModel>,
     /// Scans that the models grow from, with their window and frame.
     keyframes: BTreeMap<Label, Vec<(usize, usize, Vec<ScanPoint>)>>,
     /// What scans cost at known poses.
@@ -105,11 +105,12 @@ impl Learner {
         let reference: BTreeMap<Label, Vec<Surfel>> =
             accumulators.iter().map(|(label, a)| (*label, a.surfels())).collect();
         let gaps = surface_gaps(&reference);
-        let models = reference.iter().filter_map(|(label, s)| Some((*label, PartModel::new(s, &[])?))).collect();
+        let reference: BTreeMap<Label, PartModel> =
+            reference.iter().filter_map(|(label, s)| Some((*label, PartModel::new(s)?))).collect();
         Self {
             root,
             use_tool,
-            models,
+            models: reference.clone(),
             reference,
             keyframes: BTreeMap::new(),
             touched: BTreeSet::new(),
@@ -529,8 +530,7 @@ impl Learner {
                 for (window, frame, scan) in keyframes {
                     later.add(scan, &self.tracks[label][*window][*frame]);
                 }
-                let reference = self.reference.get(label).map_or(&[][..], Vec::as_slice);
-                (*label, PartModel::new(reference, &later.surfels()))
+                (*label, self.reference.get(label).map(|first| first.grown(&later.surfels())))
             })
             .collect();
         self.models.extend(rebuilt.into_iter().filter_map(|(label, model)| Some((label, model?))));

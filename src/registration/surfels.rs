@@ -108,25 +108,18 @@ impl SurfelAccumulator {
     }
 
     fn surfels_of_side(&self, side: u8, view: Option<&Vector3<f64>>, least: f64) -> Vec<Surfel> {
-        let reach = (NORMAL_RADIUS / VOXEL).ceil() as i32;
         let mut surfels = Vec::new();
-        let range = (side, [i32::MIN; 3])..=(side, [i32::MAX; 3]);
-        for (&(_, key), voxel) in self.voxels.range(range).filter(|(_, v)| v.count >= least) {
-            let center = voxel.sum / voxel.count;
+        let voxels = SideVoxels::new(self.voxels.range((side, [i32::MIN; 3])..=(side, [i32::MAX; 3])), least);
+        for (key, center, _) in &voxels.0 {
+            let center = *center;
             let mut count = 0.0;
             let mut sum = Vector3::zeros();
             let mut outer = Matrix3::zeros();
-            for dx in -reach..=reach {
-                for dy in -reach..=reach {
-                    let low = (side, [key[0] + dx, key[1] + dy, key[2] - reach]);
-                    let high = (side, [key[0] + dx, key[1] + dy, key[2] + reach]);
-                    for neighbour in self.voxels.range(low..=high).map(|(_, v)| v).filter(|v| v.count >= least) {
-                        if (neighbour.sum / neighbour.count - center).norm() <= NORMAL_RADIUS {
-                            count += neighbour.count;
-                            sum += neighbour.sum;
-                            outer += neighbour.outer;
-                        }
-                    }
+            for (_, mean, neighbour) in voxels.around(*key) {
+                if (mean - center).norm_squared() <= NORMAL_RADIUS * NORMAL_RADIUS {
+                    count += neighbour.count;
+                    sum += neighbour.sum;
+                    outer += neighbour.outer;
                 }
             }
             if count < 8.0 {
@@ -153,6 +146,27 @@ impl SurfelAccumulator {
             });
         }
         surfels
+    }
+}
+
+/// The voxels of one side: key, mean position \[m\] and sums, in the order of their keys.
+struct SideVoxels<'a>(Vec<([i32; 3], Vector3<f64>, &'a VoxelSum)>);
+
+impl<'a> SideVoxels<'a> {
+    fn new(range: impl Iterator<Item = (&'a (u8, [i32; 3]), &'a VoxelSum)>, least: f64) -> Self {
+        Self(range.filter(|(_, v)| v.count >= least).map(|(&(_, key), v)| (key, v.sum / v.count, v)).collect())
+    }
+
+    /// The voxels in the cube of the normals' radius around a key, in the order of their keys.
+    fn around(&self, key: [i32; 3]) -> impl Iterator<Item = &([i32; 3], Vector3<f64>, &'a VoxelSum)> {
+        let reach = (NORMAL_RADIUS / VOXEL).ceil() as i32;
+        let near = move |x: i32, middle: i32| x.abs_diff(middle) <= reach.unsigned_abs();
+        (key[0].saturating_sub(reach)..=key[0].saturating_add(reach))
+            .flat_map(move |x| {
+                let from = self.0.partition_point(|(k, ..)| [k[0], k[1]] < [x, key[1].saturating_sub(reach)]);
+                self.0[from..].iter().take_while(move |(k, ..)| k[0] == x && (k[1] <= key[1] || near(k[1], key[1])))
+            })
+            .filter(move |(k, ..)| near(k[2], key[2]))
     }
 }
 
@@ -248,13 +262,14 @@ pub struct PartModel {
 }
 
 impl PartModel {
-    /// A model of surfels seen at the reference configuration, and of those that came into view
-    /// later where the first have none. `None` with too few of the first.
-    pub fn new(reference: &[Surfel], later: &[Surfel]) -> Option<Self> {
-        if reference.len() < FEWEST_SURFELS {
-            return None;
-        }
-        let first = Self::of(reference.to_vec());
+    /// A model of the surfels seen at the reference configuration; `None` with too few of them.
+    pub fn new(reference: &[Surfel]) -> Option<Self> {
+        (reference.len() >= FEWEST_SURFELS).then(|| Self::of(reference.to_vec()))
+    }
+
+    /// This model of the first look, with the surfels that came into view later where it has none.
+    pub fn grown(&self, later: &[Surfel]) -> Self {
+        let first = self;
         let new_face = |surfel: &&Surfel| {
             first.field.nearest(&surfel.point).into_iter().flatten().all(|index| {
                 let near = &first.surfels[index as usize];
@@ -264,10 +279,10 @@ impl PartModel {
         };
         let grown: Vec<Surfel> = later.iter().filter(new_face).map(|s| Surfel { grown: true, ..*s }).collect();
         if grown.is_empty() {
-            return Some(first);
+            return first.clone();
         }
         let (centroid, radius) = (first.centroid, first.radius);
-        Some(Self { centroid, radius, ..Self::of([reference, &grown].concat()) })
+        Self { centroid, radius, ..Self::of([first.surfels.as_slice(), &grown].concat()) }
     }
 
     fn of(surfels: Vec<Surfel>) -> Self {
