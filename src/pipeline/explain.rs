@@ -16,7 +16,7 @@ use crate::model::{
     Axis, Contact, KinematicJoint, KinematicSettings, PoseMeasurement, WindowObservations, fit_kinematics,
 };
 use crate::registration::{
-    AlignmentSettings, AxisSeed, JointFrame, JointPath, OUTLIER_COST, PartModel, Quadratic, ScanPoint, fit_circle,
+    AlignmentSettings, AxisSeed, JointFrame, JointPath, OUTLIER_COST, PartModel, Quadratic, ScanPoint, align, fit_circle,
     fit_line, geometric_seeds, pose_factor, search_path, truncated_cost,
 };
 use crate::types::Label;
@@ -31,6 +31,15 @@ pub const FALSE_SHARE: f64 = 0.01;
 const START_JUMP: f64 = 0.006;
 /// A linearization is believed about this far \[m\]: weaker directions stay as predicted.
 const MEASURED_WITHIN: f64 = 0.010;
+/// Excess at which no candidate explains a part, and a free track may.
+const UNEXPLAINED: f64 = 0.3;
+/// What is found against a motion that another candidate explains badly, at most.
+const MOST_RELUCTANCE: f64 = 0.25;
+/// A part explained again must gain this much.
+const RECONSIDERED: f64 = 0.03;
+/// A free track turned or shifted by less than this shows no axis \[rad, m\].
+const LEAST_TURN: f64 = 0.08;
+const LEAST_SHIFT: f64 = 0.010;
 /// Scans with fewer points say nothing of a pose.
 pub const FEWEST_POINTS: usize = 25;
 
@@ -72,6 +81,8 @@ pub struct Scene<'a> {
     pub root: Label,
     /// Whether the tool's position is used as an observation.
     pub use_tool: bool,
+    /// Parts that do not rest, followed freely from frame to frame: only a start for what explains them.
+    pub free: BTreeMap<Label, Vec<Pose>>,
 }
 
 /// One part's motion through a window.
@@ -85,6 +96,19 @@ pub struct Motion {
     pub excess: f64,
     /// The new joint that explains it, with the parent it was found against.
     pub seed: Option<(Option<Label>, AxisSeed)>,
+    /// The part that it was explained against; `None`: the world.
+    carrier: Option<Label>,
+    /// Excess, misses of the tool and complexity: the least is taken.
+    score: f64,
+}
+
+/// What was found for parts so far against what moves: a part that is explained does not change.
+#[derive(Default)]
+struct Offers {
+    /// Along the joint that is known.
+    along: BTreeMap<Label, Option<Motion>>,
+    /// Along new joints, by part and parent.
+    refined: BTreeMap<(Label, Option<Label>), Vec<Motion>>,
 }
 
 /// The motions of all parts with a model, but the root.
@@ -99,26 +123,42 @@ pub fn explain_window(scene: &Scene<'_>) -> BTreeMap<Label, Motion> {
             open.push(label);
         }
     }
+    let scene = &Scene { free: open.par_iter().map(|&label| (label, scene.free_track(label))).collect(), ..*scene };
+    let mut offers = Offers::default();
+    let mut order = Vec::new();
     while !open.is_empty() {
-        let mut best: Option<(f64, usize, Motion)> = None;
-        let offers: Vec<Option<Motion>> = open.par_iter().map(|&label| scene.best_motion(label, &motions)).collect();
-        for (index, (&label, offer)) in open.iter().zip(offers).enumerate() {
-            let Some(motion) = offer else { continue };
-            let score =
-                motion.excess + 0.05 * (scene.tool_miss(label, &motion.displacements) / TOOL_EXPLAINED).min(20.0);
-            if best.as_ref().is_none_or(|(other, _, _)| score < *other) {
-                best = Some((score, index, motion));
-            }
-        }
-        let Some((_, index, motion)) = best else { break };
+        scene.prepare(&open, &motions, &mut offers);
+        let best = open
+            .iter()
+            .enumerate()
+            .filter_map(|(index, &label)| Some((index, scene.best_motion(label, &motions, &offers)?)))
+            .min_by(|(_, a), (_, b)| a.score.total_cmp(&b.score));
+        let Some((index, motion)) = best else { break };
         let label = open.remove(index);
-        let still = scene.evaluate(label, |_| scene.start_of(label));
-        motions.insert(label, if scene.beats(label, &motion, &still) { motion } else { still });
+        motions.insert(label, scene.accepted(label, motion));
+        order.push(label);
     }
     for label in open {
         motions.insert(label, scene.evaluate(label, |_| scene.start_of(label)));
     }
+    // What was explained first did not know of what came after it.
+    for label in order {
+        scene.reconsider(label, &mut motions, &mut offers);
+    }
     motions
+}
+
+/// Whether a part's motion was explained by way of another's.
+fn depends(motions: &BTreeMap<Label, Motion>, label: Label, on: Label) -> bool {
+    let mut at = Some(label);
+    for _ in 0..=motions.len() {
+        match at {
+            Some(part) if part == on => return true,
+            Some(part) => at = motions.get(&part).and_then(|m| m.carrier),
+            None => return false,
+        }
+    }
+    true
 }
 
 impl Scene<'_> {
@@ -161,7 +201,8 @@ impl Scene<'_> {
         let worst = worst.iter().sum::<f64>() / worst.len().max(1) as f64;
         let start = self.start_of(label);
         let moved = displacements.iter().any(|d| travel(model, &start, d) > 0.002);
-        Motion { displacements, moved, excess: mean.max(0.6 * worst), seed: None }
+        let excess = mean.max(0.6 * worst);
+        Motion { displacements, moved, excess, seed: None, carrier: None, score: excess }
     }
 
     /// Root mean square by which the tool misses a contact point that is fixed on the part \[m\].
@@ -185,61 +226,156 @@ impl Scene<'_> {
         seen || felt
     }
 
-    fn best_motion(&self, label: Label, known: &BTreeMap<Label, Motion>) -> Option<Motion> {
+    /// Excess, misses of the tool, a jump at the start, and complexity.
+    fn score(&self, label: Label, motion: &Motion, complexity: f64) -> f64 {
+        let miss = self.tool_miss(label, &motion.displacements);
+        // A motion starts where the part was.
         let model = &self.models[&label];
-        let mut best = Best { motion: None, score: f64::INFINITY };
-        let mut known_joint = false;
-        let score = |motion: &Motion, complexity: f64| {
-            let miss = self.tool_miss(label, &motion.displacements);
-            // A motion starts where the part was.
-            let jump = motion.displacements.first().map_or(0.0, |d| travel(model, &self.start_of(label), d));
-            motion.excess + complexity + 0.05 * (miss / TOOL_EXPLAINED).min(20.0) + 0.05 * (jump / START_JUMP).min(20.0)
-        };
-        // Along the joint that is known.
-        if let Some(joint) = self.joints.iter().find(|joint| joint.child == label) {
-            let parent = joint.parent.map(|p| self.joints[p].child);
-            if let Some(parents) = self.parent_track(parent, known) {
-                let motion = self.along(label, &joint.screw(), joint.joint_type, &parents);
-                known_joint = self.touched_before.contains(&label);
-                best.offer(score(&motion, 0.0), motion);
-            }
+        let jump = motion.displacements.first().map_or(0.0, |d| travel(model, &self.start_of(label), d));
+        motion.excess + complexity + 0.05 * (miss / TOOL_EXPLAINED).min(20.0) + 0.05 * (jump / START_JUMP).min(20.0)
+    }
+
+    /// The part followed by registration alone, each frame from where it would have gone on to.
+    fn free_track(&self, label: Label) -> Vec<Pose> {
+        let model = &self.models[&label];
+        let settings = AlignmentSettings { gate: 0.04, ..AlignmentSettings::default() };
+        let r = model.radius;
+        let prior = Matrix6::from_diagonal(&(Vector6::new(r * r, r * r, r * r, 1.0, 1.0, 1.0) * 2.5e3));
+        let mut track: Vec<Pose> = Vec::with_capacity(self.frames.len());
+        for k in 0..self.frames.len() {
+            let last = track.last().copied().unwrap_or_else(|| self.start_of(label));
+            let scan = self.scan(label, k);
+            let ahead = match &track[..] {
+                [.., before, last] => *last * before.inverse() * *last,
+                _ => last,
+            };
+            let cost = |pose: &Pose| truncated_cost(model, scan, scan.len() / 150, pose);
+            let start = if cost(&ahead) < cost(&last) { ahead } else { last };
+            track.push(if scan.is_empty() {
+                last
+            } else {
+                align(model, scan, &start, &prior, &settings, 6).displacement
+            });
         }
-        let movers: Vec<Label> = known.iter().filter(|(_, m)| m.moved).map(|(l, _)| *l).collect();
-        for &carrier in &movers {
-            let track = &known[&carrier].displacements;
+        track
+    }
+
+    /// Along the known joint, or carried by what moves; and whether that is enough.
+    fn simple_motion(&self, label: Label, known: &BTreeMap<Label, Motion>, offers: &Offers) -> (Option<Motion>, bool) {
+        let mut best = Best { motion: None };
+        let mut known_joint = false;
+        if let Some(Some(motion)) = offers.along.get(&label) {
+            known_joint = self.touched_before.contains(&label);
+            best.offer(self.score(label, motion, 0.0), motion.clone());
+        }
+        for (&carrier, parent) in known.iter().filter(|(l, m)| **l != label && m.moved && !depends(known, **l, label)) {
+            let track = &parent.displacements;
             let fixed = track[0].inverse() * self.start_of(label);
             let motion = self.evaluate(label, |k| track[k] * fixed);
-            best.offer(score(&motion, 0.0), motion);
+            best.offer(self.score(label, &motion, 0.0), Motion { carrier: Some(carrier), ..motion });
         }
-        let still = self.evaluate(label, |_| self.start_of(label));
-        if let Some(motion) = &best.motion {
+        let settled = best.motion.as_ref().is_some_and(|motion| {
             let held = self.tool_miss(label, &motion.displacements) < 1.5 * TOOL_EXPLAINED;
-            if held && (known_joint || motion.excess < EXPLAINED || motion.excess < 0.3 * still.excess) {
-                return best.motion;
+            let still = self.evaluate(label, |_| self.start_of(label));
+            held && (known_joint || motion.excess < EXPLAINED || motion.excess < 0.3 * still.excess)
+        });
+        (best.motion, settled)
+    }
+
+    /// What a part may hang on: the world, what moves, and what was moved before.
+    fn possible_parents(&self, label: Label, known: &BTreeMap<Label, Motion>) -> Vec<Option<Label>> {
+        let displaced = |l: Label| travel(&self.models[&l], &Pose::identity(), &self.start_of(l)) > 0.005;
+        let others = known.iter().filter(|(l, m)| **l != label && (m.moved || displaced(**l)));
+        let others = others.map(|(l, _)| *l).filter(|l| !depends(known, *l, label));
+        [None].into_iter().chain(others.map(Some)).collect()
+    }
+
+    /// Finds what the best motions of these parts are chosen from.
+    fn prepare(&self, labels: &[Label], known: &BTreeMap<Label, Motion>, offers: &mut Offers) {
+        let missing: Vec<Label> = labels.iter().copied().filter(|l| !offers.along.contains_key(l)).collect();
+        let along: Vec<(Label, Option<Motion>)> = missing
+            .par_iter()
+            .filter_map(|&label| {
+                let joint = self.joints.iter().find(|joint| joint.child == label)?;
+                let parent = joint.parent.map(|p| self.joints[p].child);
+                let parents = self.parent_track(parent, known)?;
+                let motion = self.along(label, &joint.screw(), joint.joint_type, &parents);
+                Some((label, Some(Motion { carrier: parent, ..motion })))
+            })
+            .collect();
+        offers.along.extend(along);
+        let mut pairs: Vec<(Label, Option<Label>, usize)> = Vec::new();
+        for &label in labels {
+            let (best, settled) = self.simple_motion(label, known, offers);
+            if !settled {
+                let most = if best.is_some_and(|m| m.score < 2.0 * EXPLAINED) { 1 } else { 3 };
+                let parents = self.possible_parents(label, known);
+                pairs.extend(parents.into_iter().map(|parent| (label, parent, most)));
             }
         }
-        let mut parents: Vec<Option<Label>> = vec![None];
-        parents.extend(movers.iter().map(|l| Some(*l)));
-        parents.extend(
-            known
-                .iter()
-                .filter(|(l, m)| !m.moved && travel(&self.models[*l], &Pose::identity(), &self.start_of(**l)) > 0.005)
-                .map(|(l, _)| Some(*l)),
-        );
+        pairs.retain(|(label, parent, _)| !offers.refined.contains_key(&(*label, *parent)));
+        let refined: Vec<((Label, Option<Label>), Vec<Motion>)> = pairs
+            .par_iter()
+            .map(|&(label, parent, most)| {
+                let motions = self.parent_track(parent, known).map_or_else(Vec::new, |track| {
+                    let seeds = self.seeds(label, &self.models[&label], &track, most);
+                    seeds.iter().filter_map(|seed| self.refine(label, parent, seed, &track)).collect()
+                });
+                ((label, parent), motions)
+            })
+            .collect();
+        offers.refined.extend(refined);
+    }
+
+    /// The best of what was found for a part.
+    fn best_motion(&self, label: Label, known: &BTreeMap<Label, Motion>, offers: &Offers) -> Option<Motion> {
+        let (simple, settled) = self.simple_motion(label, known, offers);
+        if settled {
+            return simple;
+        }
+        let still = self.evaluate(label, |_| self.start_of(label));
+        let carried = simple.as_ref().map_or(still.excess, |m| m.excess.min(still.excess));
         // A part that nothing touches needs a better reason for a joint of its own: what it shows anew
         // must not pass for motion.
         let touched = self.contacts.iter().any(|c| c.label == label);
-        let carried = best.motion.as_ref().map_or(still.excess, |m| m.excess.min(still.excess));
-        let reluctance = 0.02 + if touched { 0.0 } else { 0.1 + 0.4 * carried.max(0.0) };
-        let most = if best.score < 2.0 * EXPLAINED { 2 } else { 4 };
-        for (rank, parent) in parents.iter().enumerate() {
-            let Some(track) = self.parent_track(*parent, known) else { continue };
-            for seed in self.seeds(label, model, &track, most) {
-                let Some(motion) = self.refine(label, *parent, &seed, &track) else { continue };
-                best.offer(score(&motion, reluctance + if rank > 0 { 0.02 } else { 0.0 }), motion);
+        let reluctance = 0.02 + if touched { 0.0 } else { 0.1 + (0.4 * carried.max(0.0)).min(MOST_RELUCTANCE) };
+        let mut best = Best { motion: simple };
+        for parent in self.possible_parents(label, known) {
+            for motion in offers.refined.get(&(label, parent)).into_iter().flatten() {
+                let complexity = reluctance + if parent.is_some() { 0.02 } else { 0.0 };
+                best.offer(self.score(label, motion, complexity), motion.clone());
             }
         }
         best.motion
+    }
+
+    /// A motion, or rest if it does not explain clearly more, or the free track if nothing else does.
+    fn accepted(&self, label: Label, motion: Motion) -> Motion {
+        let still = self.evaluate(label, |_| self.start_of(label));
+        let motion = if self.beats(label, &motion, &still) { motion } else { still };
+        if motion.excess > UNEXPLAINED
+            && let Some(track) = self.free.get(&label)
+        {
+            let free = self.evaluate(label, |k| track[k]);
+            if free.excess < 0.4 * motion.excess {
+                return free;
+            }
+        }
+        motion
+    }
+
+    /// Explains a part again where all others are explained.
+    fn reconsider(&self, label: Label, motions: &mut BTreeMap<Label, Motion>, offers: &mut Offers) {
+        if motions[&label].excess < EXPLAINED && motions[&label].seed.is_none() {
+            return;
+        }
+        self.prepare(&[label], motions, offers);
+        let Some(motion) = self.best_motion(label, motions, offers) else { return };
+        if motion.score < motions[&label].score - RECONSIDERED {
+            let motion = self.accepted(label, motion);
+            motions.insert(label, motion);
+            offers.refined.retain(|(_, parent), _| *parent != Some(label));
+        }
     }
 
     /// Displacements of a parent through the window, if they are known.
@@ -296,7 +432,9 @@ impl Scene<'_> {
             let mut seeds: Vec<(AxisSeed, f64)> =
                 [fit_line(&track), fit_circle(&track)].into_iter().flatten().collect();
             seeds.sort_by(|a, b| a.1.total_cmp(&b.1));
-            return seeds.into_iter().map(|(seed, _)| seed).collect();
+            let mut seeds: Vec<AxisSeed> = seeds.into_iter().map(|(seed, _)| seed).collect();
+            seeds.extend(self.seeds_of_free_track(label, parents));
+            return seeds;
         }
         // Rank the shape's axes by the frames in which the part is furthest from where it started.
         let directions: Vec<Vector3<f64>> = Vec::new();
@@ -318,7 +456,34 @@ impl Scene<'_> {
             })
             .collect();
         ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
-        ranked.into_iter().take(most).map(|(_, seed)| seed).collect()
+        let followed = self.seeds_of_free_track(label, parents);
+        followed.into_iter().chain(ranked.into_iter().take(most).map(|(_, seed)| seed)).collect()
+    }
+
+    /// Axes of the motion that the free track shows relative to a parent.
+    fn seeds_of_free_track(&self, label: Label, parents: &[Pose]) -> Vec<AxisSeed> {
+        let Some(track) = self.free.get(&label) else { return Vec::new() };
+        let model = &self.models[&label];
+        let at = |k: usize| parents[k].inverse() * track[k];
+        let first = at(0);
+        let Some(last) = (0..track.len()).map(at).max_by(|a, b| travel(model, &first, a).total_cmp(&travel(model, &first, b)))
+        else {
+            return Vec::new();
+        };
+        let twist = (last * first.inverse()).log();
+        let angular: Vector3<f64> = twist.fixed_rows::<3>(0).into();
+        let linear: Vector3<f64> = twist.fixed_rows::<3>(3).into();
+        let angle = angular.norm();
+        let shift = last.transform_point(&model.centroid) - first.transform_point(&model.centroid);
+        let mut seeds = Vec::new();
+        if angle > LEAST_TURN {
+            let direction = angular / angle;
+            seeds.push(AxisSeed { direction, point: Some(direction.cross(&linear) / angle) });
+        }
+        if shift.norm() > LEAST_SHIFT {
+            seeds.push(AxisSeed { direction: shift.normalize(), point: None });
+        }
+        seeds
     }
 
     /// Refines a seed on the points themselves, with the gate closing in.
@@ -382,6 +547,7 @@ impl Scene<'_> {
         let mut motion = self.evaluate(label, |k| parents[k] * screw.displacement(positions[k]));
         let point = (joint_type == JointType::Revolute).then_some(joint.axis.point);
         motion.seed = Some((parent, AxisSeed { direction: joint.axis.direction, point }));
+        motion.carrier = parent;
         Some(motion)
     }
 }
@@ -389,13 +555,12 @@ impl Scene<'_> {
 /// The best of the motions offered so far.
 struct Best {
     motion: Option<Motion>,
-    score: f64,
 }
 
 impl Best {
     fn offer(&mut self, score: f64, motion: Motion) {
-        if score < self.score {
-            (self.score, self.motion) = (score, Some(motion));
+        if self.motion.as_ref().is_none_or(|best| score < best.score) {
+            self.motion = Some(Motion { score, ..motion });
         }
     }
 }

@@ -165,6 +165,7 @@ impl Learner {
             touched_before: &self.touched,
             root: self.root,
             use_tool: self.use_tool,
+            free: BTreeMap::new(),
         };
         let motions = explain_window(&scene);
         for (label, motion) in &motions {
@@ -278,7 +279,7 @@ impl Learner {
         let windows: Vec<&WindowObservations> = self.windows.iter().collect();
         let part = self.part(child);
         let track = parent.map(|p| self.tracks[&p].as_slice());
-        let relative = relative_windows(child, track, &windows);
+        let relative = relative_windows(&part, &self.tracks[&child], track, &windows);
         let resting = self.resting_windows(child, parent);
         let rigid = rigid_evidence(&part, &relative, &self.settings);
         let mut option = ParentEvidence { parent, log_evidence: [rigid; 3], fits: [None, None, None] };
