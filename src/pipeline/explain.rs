@@ -111,8 +111,57 @@ struct Offers {
     refined: BTreeMap<(Label, Option<Label>), Vec<Motion>>,
 }
 
+/// The motions of all parts with a model but the root, and the contacts by the parts that they explain.
+///
+/// The part nearest the tool need not be the one it holds, where parts overlap: a part that rests while
+/// the tool moves is given up for one that moves, if that explains the window better and the wrench is
+/// not bound to a part (`relabel`).
+pub fn explain_contacts(scene: &Scene<'_>, relabel: bool) -> (BTreeMap<Label, Motion>, Vec<Contact>) {
+    let mut motions = explain_window(scene);
+    let mut contacts = scene.contacts.to_vec();
+    for index in (0..contacts.len()).filter(|_| relabel) {
+        let label = contacts[index].label;
+        let miss = |label: Label| motions.get(&label).map_or(f64::INFINITY, |m| miss_of(&contacts[index], &m.displacements));
+        let own = miss(label);
+        let rests = motions.get(&label).is_some_and(|m| !m.moved);
+        let other = motions
+            .iter()
+            .filter(|(other, m)| **other != label && m.moved)
+            .map(|(other, _)| (miss(*other), *other))
+            .min_by(|a, b| a.0.total_cmp(&b.0));
+        let Some((_, other)) = other.filter(|_| rests && own > 2.0 * TOOL_EXPLAINED) else { continue };
+        let mut relabelled = contacts.clone();
+        relabelled[index].label = other;
+        let moved = explain_window(&Scene { contacts: &relabelled, free: BTreeMap::new(), ..*scene });
+        let cost = |motions: &BTreeMap<Label, Motion>, contacts: &[Contact]| {
+            let missed = contacts.iter().filter_map(|c| Some((c, motions.get(&c.label)?)));
+            let missed: f64 = missed.map(|(c, m)| miss_cost(miss_of(c, &m.displacements))).sum();
+            missed + motions.values().map(|m| m.excess).sum::<f64>()
+        };
+        tracing::debug!(%label, %other, before = cost(&motions, &contacts), after = cost(&moved, &relabelled), "relabel");
+        if cost(&moved, &relabelled) < cost(&motions, &contacts) {
+            (motions, contacts) = (moved, relabelled);
+        }
+    }
+    (motions, contacts)
+}
+
+/// Root mean square by which the tool misses a point that is fixed on a part \[m\].
+fn miss_of(contact: &Contact, displacements: &[Pose]) -> f64 {
+    let points: Vec<Vector3<f64>> =
+        contact.track.iter().map(|(k, x, _)| displacements[*k].inverse().transform_point(x)).collect();
+    let count = points.len().max(1) as f64;
+    let mean = points.iter().sum::<Vector3<f64>>() / count;
+    (points.iter().map(|p| (p - mean).norm_squared()).sum::<f64>() / count).sqrt()
+}
+
+/// What a miss of the tool counts beside an excess.
+fn miss_cost(miss: f64) -> f64 {
+    0.05 * (miss / TOOL_EXPLAINED).min(20.0)
+}
+
 /// The motions of all parts with a model, but the root.
-pub fn explain_window(scene: &Scene<'_>) -> BTreeMap<Label, Motion> {
+fn explain_window(scene: &Scene<'_>) -> BTreeMap<Label, Motion> {
     let mut motions: BTreeMap<Label, Motion> = BTreeMap::new();
     let mut open: Vec<Label> = Vec::new();
     for &label in scene.models.keys().filter(|&&label| label != scene.root) {
@@ -207,12 +256,7 @@ impl Scene<'_> {
 
     /// Root mean square by which the tool misses a contact point that is fixed on the part \[m\].
     fn tool_miss(&self, label: Label, displacements: &[Pose]) -> f64 {
-        let Some(contact) = self.contact(label) else { return 0.0 };
-        let points: Vec<Vector3<f64>> =
-            contact.track.iter().map(|(k, x, _)| displacements[*k].inverse().transform_point(x)).collect();
-        let count = points.len().max(1) as f64;
-        let mean = points.iter().sum::<Vector3<f64>>() / count;
-        (points.iter().map(|p| (p - mean).norm_squared()).sum::<f64>() / count).sqrt()
+        self.contact(label).map_or(0.0, |contact| miss_of(contact, displacements))
     }
 
     /// Whether a motion explains a part clearly better than rest. A cost that stays high either way
@@ -222,7 +266,7 @@ impl Scene<'_> {
         let share = if self.contacts.iter().any(|c| c.label == label) { 0.3 } else { 0.5 };
         let seen = gain > EXPLAINED && gain > share * still.excess;
         let miss = self.tool_miss(label, &still.displacements);
-        let felt = miss > TOOL_EXPLAINED && self.tool_miss(label, &motion.displacements) < 0.5 * miss && gain > -0.2;
+        let felt = miss > TOOL_EXPLAINED && self.tool_miss(label, &motion.displacements) < 0.5 * miss && gain > -0.2 * (1.0 + still.excess);
         seen || felt
     }
 
@@ -232,7 +276,7 @@ impl Scene<'_> {
         // A motion starts where the part was.
         let model = &self.models[&label];
         let jump = motion.displacements.first().map_or(0.0, |d| travel(model, &self.start_of(label), d));
-        motion.excess + complexity + 0.05 * (miss / TOOL_EXPLAINED).min(20.0) + 0.05 * (jump / START_JUMP).min(20.0)
+        motion.excess + complexity + miss_cost(miss) + 0.05 * (jump / START_JUMP).min(20.0)
     }
 
     /// The part followed by registration alone, each frame from where it would have gone on to.
@@ -343,6 +387,7 @@ impl Scene<'_> {
         for parent in self.possible_parents(label, known) {
             for motion in offers.refined.get(&(label, parent)).into_iter().flatten() {
                 let complexity = reluctance + if parent.is_some() { 0.02 } else { 0.0 };
+                tracing::trace!(%label, ?parent, excess = motion.excess, miss = self.tool_miss(label, &motion.displacements), score = self.score(label, motion, complexity), seed = ?motion.seed, "offer");
                 best.offer(self.score(label, motion, complexity), motion.clone());
             }
         }
@@ -352,6 +397,7 @@ impl Scene<'_> {
     /// A motion, or rest if it does not explain clearly more, or the free track if nothing else does.
     fn accepted(&self, label: Label, motion: Motion) -> Motion {
         let still = self.evaluate(label, |_| self.start_of(label));
+        tracing::trace!(%label, excess = motion.excess, score = motion.score, seed = ?motion.seed, still = still.excess, still_miss = self.tool_miss(label, &still.displacements), free = self.free.get(&label).map(|t| self.evaluate(label, |k| t[k]).excess), "accept");
         let motion = if self.beats(label, &motion, &still) { motion } else { still };
         if motion.excess > UNEXPLAINED
             && let Some(track) = self.free.get(&label)

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use nalgebra::{DMatrix, Vector3};
 use rayon::prelude::*;
 
-use super::explain::{Baseline, Frame, Motion, Scene, explain_window, measure_faces, travel};
+use super::explain::{Baseline, Frame, Motion, Scene, explain_contacts, measure_faces, travel};
 use crate::geometry::{HullProperties, hull_properties};
 use crate::math::Pose;
 use crate::mechanism::JointType;
@@ -167,18 +167,19 @@ impl Learner {
             use_tool: self.use_tool,
             free: BTreeMap::new(),
         };
-        let motions = explain_window(&scene);
+        let bound = job.wrenches.iter().any(|wrench| wrench.part.is_some());
+        let (motions, contacts) = explain_contacts(&scene, !bound);
         for (label, motion) in &motions {
             tracing::debug!(%label, moved = motion.moved, excess = motion.excess, seed = ?motion.seed, "motion");
         }
         let observations = WindowObservations {
             times_s: job.frames.iter().map(|f| f.time_s).collect(),
-            contacts: if self.use_tool { job.contacts.clone() } else { Vec::new() },
+            contacts: if self.use_tool { contacts.clone() } else { Vec::new() },
             wrenches: job.wrenches.clone(),
             ..WindowObservations::default()
         };
         let moved = |label: &Label| motions.get(label).is_some_and(|m| m.moved);
-        self.touched.extend(job.contacts.iter().map(|c| c.label).filter(moved));
+        self.touched.extend(contacts.iter().map(|c| c.label).filter(moved));
         for (label, motion) in &motions {
             self.tracks.entry(*label).or_default().push(motion.displacements.clone());
         }
@@ -200,10 +201,10 @@ impl Learner {
                 self.displacements.insert(*label, *end);
             }
         }
-        self.learn_dynamics(job);
+        self.learn_dynamics(job, &contacts);
     }
 
-    fn learn_dynamics(&mut self, job: &WindowJob) {
+    fn learn_dynamics(&mut self, job: &WindowJob, contacts: &[Contact]) {
         for (label, model) in &self.models {
             let points: Vec<Vector3<f64>> = model.surfels.iter().map(|s| s.point).collect();
             if let Some(hull) = hull_properties(&points, None) {
@@ -214,7 +215,7 @@ impl Learner {
         let windows: Vec<&WindowObservations> = self.windows.iter().collect();
         let input = DynamicsInput {
             windows: &windows,
-            contacts: &job.contacts,
+            contacts,
             zero: job.zero,
             parts: &self.hulls,
             use_tool: self.use_tool,
