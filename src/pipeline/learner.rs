@@ -33,6 +33,11 @@ const CONTACT_GAP: f64 = 0.03;
 const CONTACT_GAP_SIGMA: f64 = 0.02;
 /// Log prior lost at most by parts that are far apart \[nats\].
 const FARTHEST_PENALTY: f64 = 40.0;
+/// Points of a scan, and windows, that are kept for measuring again.
+const KEPT_POINTS: usize = 300;
+const KEPT_WINDOWS: usize = 16;
+/// A part is measured again where a later fit has moved it by more than this \[m\].
+const MEASURED_AGAIN: f64 = 0.002;
 /// Scans kept from each window for growing a part's model, and in all.
 const KEYFRAMES_PER_WINDOW: usize = 10;
 const MOST_KEYFRAMES: usize = 40;
@@ -73,6 +78,11 @@ pub struct Learner {
     reference: BTreeMap<Label, PartModel>,
     /// Scans that the models grow from, with their window and frame.
     keyframes: BTreeMap<Label, Vec<(usize, usize, Vec<ScanPoint>)>>,
+    /// Scans of the parts that moved, by window, thinned: they are measured again where a later fit has
+    /// them elsewhere. Empty where forgotten.
+    kept: Vec<Vec<Frame>>,
+    /// Where each part was when each window's scans were measured last.
+    measured_at: BTreeMap<Label, Vec<Vec<Pose>>>,
     /// What scans cost at known poses.
     pub baselines: BTreeMap<Label, Baseline>,
     /// Parts that the tool has moved.
@@ -114,6 +124,8 @@ impl Learner {
             reference,
             keyframes: BTreeMap::new(),
             touched: BTreeSet::new(),
+            kept: Vec::new(),
+            measured_at: BTreeMap::new(),
             gaps,
             baselines: BTreeMap::new(),
             displacements: BTreeMap::new(),
@@ -185,15 +197,18 @@ impl Learner {
         }
         self.windows.push(observations);
         self.grow(job, &motions);
+        let last = self.windows.len() - 1;
         for label in motions.keys() {
-            self.measure(*label, &job.frames);
+            self.measure(*label, last, &job.frames);
         }
+        self.keep(job, &motions);
         self.weigh_edges(&motions);
         self.fit_joints();
         self.rebuild_models();
         let labels: Vec<Label> = self.joints().iter().map(|j| j.child).collect();
         for label in labels {
-            self.measure(label, &job.frames);
+            self.measure(label, last, &job.frames);
+            self.measure_again(label);
         }
         self.fit_joints();
         for (label, tracks) in &self.tracks {
@@ -223,10 +238,10 @@ impl Learner {
         self.inferences.push(self.dynamics.learn_window(fit, &input));
     }
 
-    /// Measures a part's poses in the last window, about its track.
-    fn measure(&mut self, label: Label, frames: &[Frame]) {
+    /// Measures a part's poses in a window, about its track.
+    fn measure(&mut self, label: Label, window: usize, frames: &[Frame]) {
         let settings = AlignmentSettings { gate: 0.02, ..AlignmentSettings::default() };
-        let Some(track) = self.tracks.get(&label).and_then(|t| t.last()) else { return };
+        let Some(track) = self.tracks.get(&label).and_then(|t| t.get(window)) else { return };
         let faces: Vec<_> = frames
             .iter()
             .zip(track)
@@ -235,9 +250,50 @@ impl Learner {
                 _ => [None; 2],
             })
             .collect();
-        if let Some(window) = self.windows.last_mut() {
+        let measured_at = self.measured_at.entry(label).or_default();
+        measured_at.resize(measured_at.len().max(window + 1), Vec::new());
+        measured_at[window].clone_from(track);
+        if let Some(window) = self.windows.get_mut(window) {
             window.poses.insert(label, faces.iter().map(|f| f[0]).collect());
             window.later_faces.insert(label, faces.iter().map(|f| f[1]).collect());
+        }
+    }
+
+    /// Keeps the window's scans of what moved, and forgets those of the oldest window beyond what is kept.
+    fn keep(&mut self, job: &WindowJob, motions: &BTreeMap<Label, Motion>) {
+        let thinned = |scan: &Vec<ScanPoint>| {
+            let every = scan.len().div_ceil(KEPT_POINTS).max(1);
+            scan.iter().copied().step_by(every).collect()
+        };
+        let frames = job.frames.iter().map(|frame| Frame {
+            time_s: frame.time_s,
+            scans: frame
+                .scans
+                .iter()
+                .filter(|(label, _)| motions.get(label).is_some_and(|m| m.moved))
+                .map(|(label, scan)| (*label, thinned(scan)))
+                .collect(),
+        });
+        self.kept.push(frames.collect());
+        if let Some(forgotten) = self.kept.len().checked_sub(KEPT_WINDOWS + 1) {
+            self.kept[forgotten].clear();
+        }
+    }
+
+    /// Measures a part again in the earlier windows where the fit has moved it since.
+    fn measure_again(&mut self, label: Label) {
+        let Some(model) = self.models.get(&label) else { return };
+        let elsewhere: Vec<usize> = (0..self.windows.len() - 1)
+            .filter(|&w| self.kept[w].iter().any(|frame| frame.scans.contains_key(&label)))
+            .filter(|&w| {
+                let Some(before) = self.measured_at.get(&label).and_then(|m| m.get(w)) else { return false };
+                before.iter().zip(&self.tracks[&label][w]).any(|(old, new)| travel(model, old, new) > MEASURED_AGAIN)
+            })
+            .collect();
+        for w in elsewhere {
+            let frames = std::mem::take(&mut self.kept[w]);
+            self.measure(label, w, &frames);
+            self.kept[w] = frames;
         }
     }
 
