@@ -16,13 +16,20 @@ use crate::model::{
     Axis, Contact, KinematicJoint, KinematicSettings, PoseMeasurement, WindowObservations, fit_kinematics,
 };
 use crate::registration::{
-    AlignmentSettings, AxisSeed, JointFrame, JointPath, OUTLIER_COST, PartModel, Quadratic, ScanPoint, align, fit_circle,
-    fit_line, geometric_seeds, pose_factor, search_path, truncated_cost,
+    AlignmentSettings, AxisSeed, JointFrame, JointPath, OUTLIER_COST, PartModel, Quadratic, ScanPoint, align,
+    fit_circle, fit_line, geometric_seeds, outline_quadratic, pose_factor, rays_near, search_path, seen_through,
+    truncated_cost,
 };
 use crate::types::Label;
 
 /// Excess of the mean truncated cost over the part's own baseline that counts as explained.
 const EXPLAINED: f64 = 0.12;
+/// Excess of a scan where a part is seen through.
+const SEEN_THROUGH_COST: f64 = 2.0;
+/// Share of rays that may seem to go through a part by their labels and flying pixels.
+const WRONG_LABELS: f64 = 0.1;
+/// Rays of other parts looked at when a motion is judged.
+const EVERY_RAY: usize = 3;
 /// A tool track explained to this root mean square is explained \[m\].
 const TOOL_EXPLAINED: f64 = 0.003;
 /// Share of the largest eigenvalue of a factor that rough normals may pretend to hold.
@@ -121,7 +128,8 @@ pub fn explain_contacts(scene: &Scene<'_>, relabel: bool) -> (BTreeMap<Label, Mo
     let mut contacts = scene.contacts.to_vec();
     for index in (0..contacts.len()).filter(|_| relabel) {
         let label = contacts[index].label;
-        let miss = |label: Label| motions.get(&label).map_or(f64::INFINITY, |m| miss_of(&contacts[index], &m.displacements));
+        let miss =
+            |label: Label| motions.get(&label).map_or(f64::INFINITY, |m| miss_of(&contacts[index], &m.displacements));
         let own = miss(label);
         let rests = motions.get(&label).is_some_and(|m| !m.moved);
         let other = motions
@@ -239,7 +247,8 @@ impl Scene<'_> {
                 // do not. Either may happen, so the smaller excess is taken.
                 let per_point = cost - baseline.cost;
                 let matched = (OUTLIER_COST - cost) * scan.len() as f64 / baseline.points.max(1.0);
-                per_point.min(OUTLIER_COST - baseline.cost - matched).max(-0.3)
+                let excess = per_point.min(OUTLIER_COST - baseline.cost - matched).max(-0.3);
+                excess + SEEN_THROUGH_COST * self.seen_through(label, k, d)
             })
             .collect();
         let mean = costs.iter().sum::<f64>() / costs.len().max(1) as f64;
@@ -254,6 +263,19 @@ impl Scene<'_> {
         Motion { displacements, moved, excess, seed: None, carrier: None, score: excess }
     }
 
+    /// The share of rays through where the part's faces would be that ended behind them.
+    fn seen_through(&self, label: Label, frame: usize, displacement: &Pose) -> f64 {
+        let model = &self.models[&label];
+        if model.outlines.is_empty() {
+            return 0.0;
+        }
+        let others = self.frames[frame].scans.iter().filter(|(other, _)| **other != label);
+        let others = others.flat_map(|(_, scan)| scan).step_by(EVERY_RAY);
+        let near = rays_near(others, &displacement.transform_point(&model.centroid), model.reach());
+        let share = seen_through(model, self.scan(label, frame), (&near, EVERY_RAY), displacement);
+        ((share - WRONG_LABELS) / (1.0 - WRONG_LABELS)).max(0.0)
+    }
+
     /// Root mean square by which the tool misses a contact point that is fixed on the part \[m\].
     fn tool_miss(&self, label: Label, displacements: &[Pose]) -> f64 {
         self.contact(label).map_or(0.0, |contact| miss_of(contact, displacements))
@@ -266,7 +288,9 @@ impl Scene<'_> {
         let share = if self.contacts.iter().any(|c| c.label == label) { 0.3 } else { 0.5 };
         let seen = gain > EXPLAINED && gain > share * still.excess;
         let miss = self.tool_miss(label, &still.displacements);
-        let felt = miss > TOOL_EXPLAINED && self.tool_miss(label, &motion.displacements) < 0.5 * miss && gain > -0.2 * (1.0 + still.excess);
+        let felt = miss > TOOL_EXPLAINED
+            && self.tool_miss(label, &motion.displacements) < 0.5 * miss
+            && gain > -0.2 * (1.0 + still.excess);
         seen || felt
     }
 
@@ -512,7 +536,8 @@ impl Scene<'_> {
         let model = &self.models[&label];
         let at = |k: usize| parents[k].inverse() * track[k];
         let first = at(0);
-        let Some(last) = (0..track.len()).map(at).max_by(|a, b| travel(model, &first, a).total_cmp(&travel(model, &first, b)))
+        let Some(last) =
+            (0..track.len()).map(at).max_by(|a, b| travel(model, &first, a).total_cmp(&travel(model, &first, b)))
         else {
             return Vec::new();
         };
@@ -561,14 +586,17 @@ impl Scene<'_> {
         // Faces that come into view match wrongly at first: where the tool is felt, it leads.
         let shared_error = if contact.is_some() { 0.010 } else { KinematicSettings::default().shared_error };
         let settings = KinematicSettings { steps: 8, shared_error, ..KinematicSettings::default() };
-        for gate in [0.05, 0.03, 0.02] {
+        for (gate, last) in [(0.05, false), (0.03, false), (0.02, true)] {
             let alignment = AlignmentSettings { gate, ..AlignmentSettings::default() };
             let screw = joint.screw();
             let relative: Vec<Pose> = positions.iter().map(|&q| screw.displacement(q)).collect();
             let poses = (0..self.frames.len())
                 .map(|k| {
                     let scan = self.scan(label, k);
-                    let measured = measure(model, scan, &(parents[k] * relative[k]), &alignment)?;
+                    let predicted = parents[k] * relative[k];
+                    // Outlines hold what is nearly in place.
+                    let past = if last { rays_past(&self.frames[k], label, model, &predicted) } else { Vec::new() };
+                    let measured = measure_past(model, scan, &past, &predicted, &alignment)?;
                     Some(PoseMeasurement { displacement: parents[k].inverse() * measured.displacement, ..measured })
                 })
                 .collect();
@@ -619,6 +647,17 @@ pub fn measure(
     predicted: &Pose,
     settings: &AlignmentSettings,
 ) -> Option<PoseMeasurement> {
+    measure_past(model, scan, &[], predicted, settings)
+}
+
+/// As `measure`, with the rays that go past the part: they show where its outline is not.
+fn measure_past(
+    model: &PartModel,
+    scan: &[ScanPoint],
+    past: &[ScanPoint],
+    predicted: &Pose,
+    settings: &AlignmentSettings,
+) -> Option<PoseMeasurement> {
     if scan.len() < FEWEST_POINTS {
         return None;
     }
@@ -627,13 +666,14 @@ pub fn measure(
         return None;
     }
     let whole = Quadratic { hessian: factor.hessian(), gradient: factor.gradient() };
-    Some(measurement_of(model, &whole, predicted))
+    Some(measurement_with_outline(model, &whole, scan, past, predicted))
 }
 
-/// As `measure`, apart for the faces of the first look and for those that came into view later.
+/// As `measure_past`, apart for the faces of the first look and for those that came into view later.
 pub fn measure_faces(
     model: &PartModel,
     scan: &[ScanPoint],
+    past: &[ScanPoint],
     predicted: &Pose,
     settings: &AlignmentSettings,
 ) -> [Option<PoseMeasurement>; 2] {
@@ -644,17 +684,50 @@ pub fn measure_faces(
     if factor.matched < FEWEST_POINTS {
         return [None; 2];
     }
-    factor.faces.map(|face| (face.hessian.trace() > 0.0).then(|| measurement_of(model, &face, predicted)))
+    let [first, later] = factor.faces;
+    [
+        (first.hessian.trace() > 0.0).then(|| measurement_with_outline(model, &first, scan, past, predicted)),
+        (later.hessian.trace() > 0.0).then(|| measurement_of(model, &later, predicted)),
+    ]
+}
+
+/// The points of a frame whose rays may pass a part.
+pub fn rays_past(frame: &Frame, label: Label, model: &PartModel, displacement: &Pose) -> Vec<ScanPoint> {
+    if model.outlines.is_empty() {
+        return Vec::new();
+    }
+    let others = frame.scans.iter().filter(|(other, _)| **other != label).flat_map(|(_, scan)| scan);
+    rays_near(others, &displacement.transform_point(&model.centroid), model.reach())
+}
+
+fn measurement_with_outline(
+    model: &PartModel,
+    factor: &Quadratic,
+    scan: &[ScanPoint],
+    past: &[ScanPoint],
+    predicted: &Pose,
+) -> PoseMeasurement {
+    let mut held = factor.cleaned(model.radius, FALSE_SHARE);
+    if !past.is_empty() {
+        let outline = outline_quadratic(&model.outlines, scan, past, predicted, &model.centroid, model.radius);
+        held.hessian += outline.hessian;
+        held.gradient += outline.gradient;
+    }
+    optimum(model, &held, predicted)
 }
 
 /// The pose measurement of a factor taken at `predicted`.
 pub fn measurement_of(model: &PartModel, factor: &Quadratic, predicted: &Pose) -> PoseMeasurement {
-    let information = factor.information(model.radius, FALSE_SHARE);
+    optimum(model, &factor.cleaned(model.radius, FALSE_SHARE), predicted)
+}
+
+fn optimum(model: &PartModel, held: &Quadratic, predicted: &Pose) -> PoseMeasurement {
+    let information = held.hessian;
     let weak =
         Vector6::new(model.radius, model.radius, model.radius, 1.0, 1.0, 1.0).map(|s| s * s / MEASURED_WITHIN.powi(2));
     let step = (information + Matrix6::from_diagonal(&weak))
         .cholesky()
-        .map_or_else(Vector6::zeros, |c| -c.solve(&factor.gradient));
+        .map_or_else(Vector6::zeros, |c| -c.solve(&held.gradient));
     let length = step.fixed_rows::<3>(0).norm() * model.radius + step.fixed_rows::<3>(3).norm();
     let step = if length > 3.0 * MEASURED_WITHIN { step * (3.0 * MEASURED_WITHIN / length) } else { step };
     let displacement = *predicted

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use nalgebra::{DMatrix, Vector3};
 use rayon::prelude::*;
 
-use super::explain::{Baseline, Frame, Motion, Scene, explain_contacts, measure_faces, travel};
+use super::explain::{Baseline, Frame, Motion, Scene, explain_contacts, measure_faces, rays_past, travel};
 use crate::geometry::{HullProperties, hull_properties};
 use crate::math::Pose;
 use crate::mechanism::JointType;
@@ -15,7 +15,7 @@ use crate::model::{
 };
 use crate::model::{DynamicsInput, DynamicsLearner, WindowInference};
 use crate::registration::{
-    AlignmentSettings, PartModel, ScanPoint, Surfel, SurfelAccumulator, fit_circle, fit_line, truncated_cost,
+    AlignmentSettings, PartModel, ScanPoint, Surfel, SurfelAccumulator, fit_circle, fit_line, rays_near, truncated_cost,
 };
 use crate::structure::TreeDistribution;
 use crate::types::{AppliedWrench, Label};
@@ -33,9 +33,8 @@ const CONTACT_GAP: f64 = 0.03;
 const CONTACT_GAP_SIGMA: f64 = 0.02;
 /// Log prior lost at most by parts that are far apart \[nats\].
 const FARTHEST_PENALTY: f64 = 40.0;
-/// Points of a scan, and windows, that are kept for measuring again.
-const KEPT_POINTS: usize = 300;
-const KEPT_WINDOWS: usize = 16;
+/// Windows whose frames are kept for measuring again: about 7 MB each.
+const KEPT_WINDOWS: usize = 8;
 /// A part is measured again where a later fit has moved it by more than this \[m\].
 const MEASURED_AGAIN: f64 = 0.002;
 /// Scans kept from each window for growing a part's model, and in all.
@@ -78,8 +77,7 @@ pub struct Learner {
     reference: BTreeMap<Label, PartModel>,
     /// Scans that the models grow from, with their window and frame.
     keyframes: BTreeMap<Label, Vec<(usize, usize, Vec<ScanPoint>)>>,
-    /// Scans of the parts that moved, by window, thinned: they are measured again where a later fit has
-    /// them elsewhere. Empty where forgotten.
+    /// Frames by window, measured again where a later fit has a part elsewhere. Empty where forgotten.
     kept: Vec<Vec<Frame>>,
     /// Where each part was when each window's scans were measured last.
     measured_at: BTreeMap<Label, Vec<Vec<Pose>>>,
@@ -147,6 +145,17 @@ impl Learner {
 
     /// Sets the baselines from frames at the reference configuration.
     pub fn calibrate(&mut self, frames: &[Frame]) {
+        for (label, model) in &mut self.reference {
+            let scans: Vec<(&[ScanPoint], Vec<ScanPoint>)> = frames
+                .iter()
+                .filter_map(|frame| {
+                    let others = frame.scans.iter().filter(|(other, _)| *other != label).flat_map(|(_, scan)| scan);
+                    Some((frame.scans.get(label)?.as_slice(), rays_near(others, &model.centroid, model.reach())))
+                })
+                .collect();
+            model.calibrate_outlines(&scans);
+        }
+        self.models = self.reference.clone();
         for (label, model) in &self.models {
             let scans: Vec<&Vec<ScanPoint>> =
                 frames.iter().filter_map(|f| f.scans.get(label)).filter(|scan| !scan.is_empty()).collect();
@@ -201,7 +210,7 @@ impl Learner {
         for label in motions.keys() {
             self.measure(*label, last, &job.frames);
         }
-        self.keep(job, &motions);
+        self.keep(job);
         self.weigh_edges(&motions);
         self.fit_joints();
         self.rebuild_models();
@@ -228,13 +237,8 @@ impl Learner {
         }
         let Some(fit) = &self.fit else { return };
         let windows: Vec<&WindowObservations> = self.windows.iter().collect();
-        let input = DynamicsInput {
-            windows: &windows,
-            contacts,
-            zero: job.zero,
-            parts: &self.hulls,
-            use_tool: self.use_tool,
-        };
+        let input =
+            DynamicsInput { windows: &windows, contacts, zero: job.zero, parts: &self.hulls, use_tool: self.use_tool };
         self.inferences.push(self.dynamics.learn_window(fit, &input));
     }
 
@@ -246,7 +250,10 @@ impl Learner {
             .iter()
             .zip(track)
             .map(|(frame, displacement)| match (self.models.get(&label), frame.scans.get(&label)) {
-                (Some(model), Some(scan)) => measure_faces(model, scan, displacement, &settings),
+                (Some(model), Some(scan)) => {
+                    let past = rays_past(frame, label, model, displacement);
+                    measure_faces(model, scan, &past, displacement, &settings)
+                }
                 _ => [None; 2],
             })
             .collect();
@@ -259,22 +266,9 @@ impl Learner {
         }
     }
 
-    /// Keeps the window's scans of what moved, and forgets those of the oldest window beyond what is kept.
-    fn keep(&mut self, job: &WindowJob, motions: &BTreeMap<Label, Motion>) {
-        let thinned = |scan: &Vec<ScanPoint>| {
-            let every = scan.len().div_ceil(KEPT_POINTS).max(1);
-            scan.iter().copied().step_by(every).collect()
-        };
-        let frames = job.frames.iter().map(|frame| Frame {
-            time_s: frame.time_s,
-            scans: frame
-                .scans
-                .iter()
-                .filter(|(label, _)| motions.get(label).is_some_and(|m| m.moved))
-                .map(|(label, scan)| (*label, thinned(scan)))
-                .collect(),
-        });
-        self.kept.push(frames.collect());
+    /// Keeps the window's frames, and forgets those of the oldest window beyond what is kept.
+    fn keep(&mut self, job: &WindowJob) {
+        self.kept.push(job.frames.clone());
         if let Some(forgotten) = self.kept.len().checked_sub(KEPT_WINDOWS + 1) {
             self.kept[forgotten].clear();
         }

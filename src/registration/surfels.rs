@@ -6,6 +6,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::ScanPoint;
 use super::field::NearestField;
+use super::outline::Outline;
 use crate::math::Pose;
 
 /// Edge of the averaging voxels \[m\].
@@ -258,6 +259,8 @@ pub struct PartModel {
     pub centroid: Vector3<f64>,
     /// Root-mean-square distance from the centroid \[m\]: scales rotations to lengths.
     pub radius: f64,
+    /// Outlines of its flat faces at the first look, once they are calibrated.
+    pub outlines: Vec<Outline>,
     pub(super) field: NearestField,
 }
 
@@ -282,7 +285,8 @@ impl PartModel {
             return first.clone();
         }
         let (centroid, radius) = (first.centroid, first.radius);
-        Self { centroid, radius, ..Self::of([first.surfels.as_slice(), &grown].concat()) }
+        let outlines = first.outlines.clone();
+        Self { centroid, radius, outlines, ..Self::of([first.surfels.as_slice(), &grown].concat()) }
     }
 
     fn of(surfels: Vec<Surfel>) -> Self {
@@ -290,7 +294,30 @@ impl PartModel {
         let centroid = surfels.iter().map(|s| s.point).sum::<Vector3<f64>>() / count;
         let variance = surfels.iter().map(|s| (s.point - centroid).norm_squared()).sum::<f64>() / count;
         let field = NearestField::new(&surfels);
-        Self { surfels, centroid, radius: variance.sqrt().max(0.02), field }
+        Self { surfels, centroid, radius: variance.sqrt().max(0.02), outlines: Vec::new(), field }
+    }
+
+    /// Finds the outlines of the flat faces from scans at the reference configuration: the part's points
+    /// and those of all others, by frame.
+    pub fn calibrate_outlines(&mut self, scans: &[(&[ScanPoint], Vec<ScanPoint>)]) {
+        self.outlines = Outline::of(&self.surfels);
+        for outline in &mut self.outlines {
+            outline.calibrate(scans);
+        }
+    }
+
+    /// Whether the first look found surface within a voxel and a half of a place.
+    pub(super) fn has_surface_at(&self, place: &Vector3<f64>) -> bool {
+        let near = |index: u32| {
+            let surfel = &self.surfels[index as usize];
+            !surfel.grown && (surfel.point - place).norm_squared() < (1.5 * VOXEL).powi(2)
+        };
+        self.field.nearest(place).into_iter().flatten().any(near)
+    }
+
+    /// A sphere about the centroid that holds the part, and a margin \[m\].
+    pub fn reach(&self) -> f64 {
+        self.surfels.iter().map(|s| (s.point - self.centroid).norm()).fold(0.0, f64::max) + 0.05
     }
 
     /// Normals of the large flat faces seen at the first look, up to sign.
