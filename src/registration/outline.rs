@@ -271,3 +271,66 @@ fn error_function(x: f64) -> f64 {
     let polynomial = series.iter().fold(0.0, |sum, c| (sum + c) * t);
     (1.0 - polynomial * (-x * x).exp()).copysign(x)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::registration::SurfelAccumulator;
+
+    /// A board of 30 cm × 20 cm, 40 cm in front of a wall, as a sensor at the origin sees them.
+    fn rays(shift: f64) -> (Vec<ScanPoint>, Vec<ScanPoint>) {
+        let (mut board, mut wall) = (Vec::new(), Vec::new());
+        for i in -40..=40 {
+            for j in -40..=40 {
+                let direction = Vector3::new(f64::from(i) * 0.0083, f64::from(j) * 0.0083, 1.0);
+                let on_board = direction - Vector3::new(shift, 0.0, 0.0);
+                let hit = on_board.x.abs() < 0.15 && on_board.y.abs() < 0.10;
+                let point_in_world = if hit { direction } else { direction * 1.4 };
+                let scan_point = ScanPoint { point_in_world, viewpoint_in_world: Some(Vector3::zeros()) };
+                if hit { board.push(scan_point) } else { wall.push(scan_point) }
+            }
+        }
+        (board, wall)
+    }
+
+    fn board() -> PartModel {
+        let mut accumulator = SurfelAccumulator::default();
+        let (own, others) = rays(0.0);
+        accumulator.add(&own, &Pose::identity());
+        let mut model = PartModel::new(&accumulator.surfels()).expect("enough surfels");
+        model.calibrate_outlines(&[(&own, others)]);
+        model
+    }
+
+    #[test]
+    fn a_board_is_held_along_itself() {
+        let model = board();
+        assert_eq!(model.outlines.len(), 1);
+        assert_eq!(model.outlines[0].edges.len(), 4);
+        for shift in [-0.008, 0.004, 0.010] {
+            let (own, others) = rays(shift);
+            let q = outline_quadratic(&model.outlines, &own, &others, &Pose::identity(), &model.centroid, model.radius);
+            let step = -q.gradient[3] / q.hessian[(3, 3)];
+            assert!((step - shift).abs() < 0.003, "{shift}: {step}");
+        }
+    }
+
+    #[test]
+    fn a_board_that_has_gone_is_seen_through() {
+        let model = board();
+        let (own, others) = rays(0.0);
+        assert!(seen_through(&model, &own, (&others, 1), &Pose::identity()) < 0.05);
+        let (own, others) = rays(0.40);
+        assert!(seen_through(&model, &own, (&others, 1), &Pose::identity()) > 0.9);
+        let there = Pose::from_translation(Vector3::new(0.40, 0.0, 0.0));
+        assert!(seen_through(&model, &own, (&others, 1), &there) < 0.05);
+    }
+
+    #[test]
+    fn an_edge_that_was_hidden_holds_nothing() {
+        let mut model = board();
+        let (own, _) = rays(0.0);
+        model.calibrate_outlines(&[(&own, Vec::new())]);
+        assert!(model.outlines.iter().all(|outline| outline.edges.is_empty()));
+    }
+}
