@@ -40,6 +40,9 @@ const START_JUMP: f64 = 0.006;
 const MEASURED_WITHIN: f64 = 0.010;
 /// Excess at which no candidate explains a part, and a free track may.
 const UNEXPLAINED: f64 = 0.3;
+/// Excess below which a motion is explained well, and above which it is not.
+const WELL_EXPLAINED: f64 = 0.6;
+const BADLY_EXPLAINED: f64 = 0.8;
 /// What is found against a motion that another candidate explains badly, at most.
 const MOST_RELUCTANCE: f64 = 0.25;
 /// A part explained again must gain this much.
@@ -103,6 +106,8 @@ pub struct Motion {
     pub excess: f64,
     /// The new joint that explains it, with the parent it was found against.
     pub seed: Option<(Option<Label>, AxisSeed)>,
+    /// Whether it is explained: seen or felt to be there, or clearly not; `None`: in between.
+    pub explained: Option<bool>,
     /// The part that it was explained against; `None`: the world.
     carrier: Option<Label>,
     /// Excess, misses of the tool and complexity: the least is taken.
@@ -150,6 +155,10 @@ pub fn explain_contacts(scene: &Scene<'_>, relabel: bool) -> (BTreeMap<Label, Mo
         if cost(&moved, &relabelled) < cost(&motions, &contacts) {
             (motions, contacts) = (moved, relabelled);
         }
+    }
+    let scene = Scene { contacts: &contacts, free: BTreeMap::new(), ..*scene };
+    for (label, motion) in &mut motions {
+        motion.explained = scene.explains(*label, motion);
     }
     (motions, contacts)
 }
@@ -260,7 +269,7 @@ impl Scene<'_> {
         let start = self.start_of(label);
         let moved = displacements.iter().any(|d| travel(model, &start, d) > 0.002);
         let excess = mean.max(0.6 * worst);
-        Motion { displacements, moved, excess, seed: None, carrier: None, score: excess }
+        Motion { displacements, moved, excess, seed: None, explained: None, carrier: None, score: excess }
     }
 
     /// The share of rays through where the part's faces would be that ended behind them.
@@ -279,6 +288,20 @@ impl Scene<'_> {
     /// Root mean square by which the tool misses a contact point that is fixed on the part \[m\].
     fn tool_miss(&self, label: Label, displacements: &[Pose]) -> f64 {
         self.contact(label).map_or(0.0, |contact| miss_of(contact, displacements))
+    }
+
+    /// Whether a motion explains what was seen and felt of a part: new faces leave a high excess, so what
+    /// the tool goes along with counts as well.
+    fn explains(&self, label: Label, motion: &Motion) -> Option<bool> {
+        let held = self.contact(label).is_some() && motion.moved;
+        let felt = held && self.tool_miss(label, &motion.displacements) < TOOL_EXPLAINED;
+        if motion.excess < WELL_EXPLAINED || felt {
+            Some(true)
+        } else {
+            // Parts that open next to it change what is seen of a part at rest.
+            let most = if motion.moved { BADLY_EXPLAINED } else { 2.0 * BADLY_EXPLAINED };
+            (motion.excess > most).then_some(false)
+        }
     }
 
     /// Whether a motion explains a part clearly better than rest. A cost that stays high either way
@@ -382,7 +405,7 @@ impl Scene<'_> {
             }
         }
         pairs.retain(|(label, parent, _)| !offers.refined.contains_key(&(*label, *parent)));
-        let refined: Vec<((Label, Option<Label>), Vec<Motion>)> = pairs
+        let refined: Vec<(_, Vec<Motion>)> = pairs
             .par_iter()
             .map(|&(label, parent, most)| {
                 let motions = self.parent_track(parent, known).map_or_else(Vec::new, |track| {

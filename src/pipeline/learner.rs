@@ -33,6 +33,10 @@ const CONTACT_GAP: f64 = 0.03;
 const CONTACT_GAP_SIGMA: f64 = 0.02;
 /// Log prior lost at most by parts that are far apart \[nats\].
 const FARTHEST_PENALTY: f64 = 40.0;
+/// A window that is explained well counts this much against one that is not.
+const WELL_AGAINST_BADLY: f64 = 20.0;
+/// The least probability that a part's evidence stands on a wrong explanation.
+const LEAST_DOUBT: f64 = 1e-3;
 /// Windows whose frames are kept for measuring again: about 7 MB each.
 const KEPT_WINDOWS: usize = 8;
 /// A part is measured again where a later fit has moved it by more than this \[m\].
@@ -59,10 +63,24 @@ pub struct WindowJob {
 pub struct ParentEvidence {
     /// `None`: whatever never moved.
     pub parent: Option<Label>,
-    /// Log evidence of rigid, prismatic, revolute.
+    /// Log evidence of rigid, prismatic, revolute, given how the windows were explained.
     pub log_evidence: [f64; 3],
     /// The fits of the moving types.
     pub fits: [Option<EdgeFit>; 3],
+}
+
+/// In how many windows a part's motion was explained, and in how many it was not.
+#[derive(Clone, Copy, Debug, Default)]
+struct Explained {
+    well: f64,
+    badly: f64,
+}
+
+impl Explained {
+    /// Probability that the evidence stands on a wrong explanation.
+    fn doubt(&self) -> f64 {
+        (self.badly / (self.badly + WELL_AGAINST_BADLY * self.well)).clamp(LEAST_DOUBT, 1.0)
+    }
 }
 
 /// Kinematic state of everything learned.
@@ -75,6 +93,8 @@ pub struct Learner {
     pub models: BTreeMap<Label, PartModel>,
     /// Models of the first look.
     reference: BTreeMap<Label, PartModel>,
+    /// How well each part's motions were explained.
+    explained: BTreeMap<Label, Explained>,
     /// Scans that the models grow from, with their window and frame.
     keyframes: BTreeMap<Label, Vec<(usize, usize, Vec<ScanPoint>)>>,
     /// Frames by window, measured again where a later fit has a part elsewhere. Empty where forgotten.
@@ -122,6 +142,7 @@ impl Learner {
             reference,
             keyframes: BTreeMap::new(),
             touched: BTreeSet::new(),
+            explained: BTreeMap::new(),
             kept: Vec::new(),
             measured_at: BTreeMap::new(),
             gaps,
@@ -141,6 +162,11 @@ impl Learner {
     /// The likeliest joints so far, parents first.
     pub fn joints(&self) -> &[KinematicJoint] {
         self.fit.as_ref().map_or(&[], |fit| &fit.joints)
+    }
+
+    /// Probability that a part's evidence stands on a wrong explanation of its windows.
+    pub fn doubt(&self, label: Label) -> f64 {
+        self.explained.get(&label).copied().unwrap_or_default().doubt()
     }
 
     /// Sets the baselines from frames at the reference configuration.
@@ -192,6 +218,14 @@ impl Learner {
         let (motions, contacts) = explain_contacts(&scene, !bound);
         for (label, motion) in &motions {
             tracing::debug!(%label, moved = motion.moved, excess = motion.excess, seed = ?motion.seed, "motion");
+        }
+        for (label, motion) in &motions {
+            let explained = self.explained.entry(*label).or_default();
+            match motion.explained {
+                Some(true) if motion.moved => explained.well += 1.0,
+                Some(false) => explained.badly += 1.0,
+                _ => {}
+            }
         }
         let observations = WindowObservations {
             times_s: job.frames.iter().map(|f| f.time_s).collect(),
