@@ -8,7 +8,7 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix6, Vector3, Vector6};
 use serde::{Deserialize, Serialize};
 
 use super::kinematics::{Axis, KinematicJoint, KinematicSettings, fit_kinematics};
@@ -25,6 +25,8 @@ const AXIS_DIRECTION_PRIOR: f64 = 1.0;
 /// Frames of one scene are not independent looks: their evidence is raised to this power.
 const TEMPERATURE: f64 = 0.5;
 
+/// How loosely a part is held to its own track where scans leave it free \[m\].
+const TRACK_SIGMA: f64 = 0.02;
 /// What a moving parent's own track adds to the tool's position seen from it \[m\].
 const PARENT_SIGMA: f64 = 0.002;
 
@@ -52,14 +54,21 @@ pub struct EdgeFit {
     pub by_window: Vec<f64>,
 }
 
-/// The windows seen from a parent that moves along a track (by window and frame).
+/// The windows seen from a parent that moves along a track, as the child does along its `own` (by
+/// window and frame).
+///
+/// What the scans leave free is held loosely to the child's own track: the evidence of other edges
+/// stands on it, so that a part that is hardly seen cannot carry others and rest at the same time.
 pub fn relative_windows(
-    child: &EdgePart,
+    part: &EdgePart,
+    own: &[Vec<Pose>],
     parent: Option<(&EdgePart, &[Vec<Pose>])>,
     windows: &[&WindowObservations],
 ) -> Vec<WindowObservations> {
-    let (track, center) = (parent.map(|(_, track)| track), child.center);
-    let child = child.label;
+    let (track, center) = (parent.map(|(_, track)| track), part.center);
+    let child = part.label;
+    let r = part.radius;
+    let loose = Matrix6::from_diagonal(&(Vector6::new(r * r, r * r, r * r, 1.0, 1.0, 1.0) / TRACK_SIGMA.powi(2)));
     windows
         .iter()
         .enumerate()
@@ -84,9 +93,17 @@ pub fn relative_windows(
                     .into_iter()
                     .collect()
             };
+            let mut poses: BTreeMap<Label, Vec<Option<PoseMeasurement>>> = relative(&window.poses);
+            if let Some(poses) = poses.get_mut(&child) {
+                for (k, measured) in poses.iter_mut().enumerate() {
+                    let unseen =
+                        PoseMeasurement { displacement: reference(k) * own[w][k], information: Matrix6::zeros() };
+                    measured.get_or_insert(unseen).information += loose;
+                }
+            }
             WindowObservations {
                 times_s: window.times_s.clone(),
-                poses: relative(&window.poses),
+                poses,
                 later_faces: relative(&window.later_faces),
                 direct: window.direct.clone(),
                 contacts: window

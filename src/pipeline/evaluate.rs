@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::explain::{explain_window, measure};
+use super::explain::{explain_contacts, measure};
 use super::{Learner, Pipeline, PipelineSettings, ResumeError, SavedObject, WindowJob};
 use crate::math::Pose;
 use crate::mechanism::{JointType, WrenchSample};
@@ -85,7 +85,7 @@ impl Scoring {
 impl Learner {
     /// Where the known joints were in a window's frames, each part measured against its model.
     fn measured_path(&mut self, job: &WindowJob) -> MeasuredPath {
-        let motions = explain_window(&self.scene(job), self.posed_motions(job).0);
+        let (motions, _) = explain_contacts(&self.scene(job), &self.posed_motions(job).0, false);
         let settings = AlignmentSettings { gate: GATE, ..AlignmentSettings::default() };
         for (label, motion) in &motions {
             if let Some(end) = motion.displacements.last() {

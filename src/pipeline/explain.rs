@@ -18,13 +18,20 @@ use crate::model::{
     Axis, Contact, KinematicJoint, KinematicSettings, PoseMeasurement, WindowObservations, fit_kinematics,
 };
 use crate::registration::{
-    AlignmentSettings, AxisSeed, JointFrame, JointPath, OUTLIER_COST, PartModel, Quadratic, ScanPoint, fit_circle,
-    fit_line, geometric_seeds, pose_factor, search_path, truncated_cost,
+    AlignmentSettings, AxisSeed, JointFrame, JointPath, OUTLIER_COST, PartModel, Quadratic, ScanPoint, align,
+    fit_circle, fit_line, geometric_seeds, outline_quadratic, pose_factor, rays_near, search_path, seen_through,
+    truncated_cost,
 };
 use crate::types::Label;
 
 /// Excess of the mean truncated cost over the part's own baseline that counts as explained.
 const EXPLAINED: f64 = 0.12;
+/// Excess of a scan where a part is seen through.
+const SEEN_THROUGH_COST: f64 = 2.0;
+/// Share of rays that may seem to go through a part by their labels and flying pixels.
+const WRONG_LABELS: f64 = 0.1;
+/// Rays of other parts looked at when a motion is judged.
+const EVERY_RAY: usize = 3;
 /// A tool track explained to this root mean square is explained \[m\].
 const TOOL_EXPLAINED: f64 = 0.003;
 /// Excess at which a part that was taken for the root is looked at like the others.
@@ -35,6 +42,18 @@ pub const FALSE_SHARE: f64 = 0.01;
 const START_JUMP: f64 = 0.006;
 /// A linearization is believed about this far \[m\]: weaker directions stay as predicted.
 const MEASURED_WITHIN: f64 = 0.010;
+/// Excess at which no candidate explains a part, and a free track may.
+const UNEXPLAINED: f64 = 0.3;
+/// Excess below which a motion is explained well, and above which it is not.
+const WELL_EXPLAINED: f64 = 0.6;
+const BADLY_EXPLAINED: f64 = 0.8;
+/// What is found against a motion that another candidate explains badly, at most.
+const MOST_RELUCTANCE: f64 = 0.25;
+/// A part explained again must gain this much.
+const RECONSIDERED: f64 = 0.03;
+/// A free track turned or shifted by less than this shows no axis \[rad, m\].
+const LEAST_TURN: f64 = 0.08;
+const LEAST_SHIFT: f64 = 0.010;
 /// Scans with fewer points say nothing of a pose.
 pub const FEWEST_POINTS: usize = 25;
 
@@ -61,7 +80,6 @@ pub struct Baseline {
 }
 
 /// What a window's motion is explained with.
-#[derive(Clone, Copy)]
 pub struct Scene<'a> {
     /// The window's frames.
     pub frames: &'a [Frame],
@@ -81,6 +99,8 @@ pub struct Scene<'a> {
     pub root: Option<Label>,
     /// Whether the tool's position is used as an observation.
     pub use_tool: bool,
+    /// Parts that do not rest, followed freely from frame to frame: only a start for what explains them.
+    pub free: BTreeMap<Label, Vec<Pose>>,
 }
 
 /// One part's motion through a window.
@@ -94,11 +114,91 @@ pub struct Motion {
     pub excess: f64,
     /// The new joint that explains it, with the parent it was found against.
     pub seed: Option<(Option<Label>, AxisSeed)>,
+    /// Whether it is explained: seen or felt to be there, or clearly not; `None`: in between.
+    pub explained: Option<bool>,
+    /// The part that it was explained against; `None`: the world.
+    carrier: Option<Label>,
+    /// Excess, misses of the tool and complexity: the least is taken.
+    score: f64,
+}
+
+impl Motion {
+    /// A motion that was measured, and needs no explanation.
+    pub fn measured(displacements: Vec<Pose>, moved: bool) -> Self {
+        Self { displacements, moved, excess: 0.0, seed: None, explained: Some(true), carrier: None, score: 0.0 }
+    }
+}
+
+/// What was found for parts so far against what moves: a part that is explained does not change.
+#[derive(Default)]
+struct Offers {
+    /// Along the joint that is known.
+    along: BTreeMap<Label, Option<Motion>>,
+    /// Along new joints, by part and parent.
+    refined: BTreeMap<(Label, Option<Label>), Vec<Motion>>,
+}
+
+/// The motions of all parts with a model but the root, and the contacts by the parts that they explain.
+///
+/// The part nearest the tool need not be the one it holds, where parts overlap: a part that rests while
+/// the tool moves is given up for one that moves, if that explains the window better and the wrench is
+/// not bound to a part (`relabel`). `measured` are motions that need no explanation.
+pub fn explain_contacts(
+    scene: &Scene<'_>,
+    measured: &BTreeMap<Label, Motion>,
+    relabel: bool,
+) -> (BTreeMap<Label, Motion>, Vec<Contact>) {
+    let mut motions = explain_window(scene, measured);
+    let mut contacts = scene.contacts.to_vec();
+    for index in (0..contacts.len()).filter(|_| relabel) {
+        let label = contacts[index].label;
+        let miss =
+            |label: Label| motions.get(&label).map_or(f64::INFINITY, |m| miss_of(&contacts[index], &m.displacements));
+        let own = miss(label);
+        let rests = motions.get(&label).is_some_and(|m| !m.moved);
+        let other = motions
+            .iter()
+            .filter(|(other, m)| **other != label && m.moved)
+            .map(|(other, _)| (miss(*other), *other))
+            .min_by(|a, b| a.0.total_cmp(&b.0));
+        let Some((_, other)) = other.filter(|_| rests && own > 2.0 * TOOL_EXPLAINED) else { continue };
+        let mut relabelled = contacts.clone();
+        relabelled[index].label = other;
+        let moved = explain_window(&Scene { contacts: &relabelled, free: BTreeMap::new(), ..*scene }, measured);
+        let cost = |motions: &BTreeMap<Label, Motion>, contacts: &[Contact]| {
+            let missed = contacts.iter().filter_map(|c| Some((c, motions.get(&c.label)?)));
+            let missed: f64 = missed.map(|(c, m)| miss_cost(miss_of(c, &m.displacements))).sum();
+            missed + motions.values().map(|m| m.excess).sum::<f64>()
+        };
+        tracing::debug!(%label, %other, before = cost(&motions, &contacts), after = cost(&moved, &relabelled), "relabel");
+        if cost(&moved, &relabelled) < cost(&motions, &contacts) {
+            (motions, contacts) = (moved, relabelled);
+        }
+    }
+    let scene = Scene { contacts: &contacts, free: BTreeMap::new(), ..*scene };
+    for (label, motion) in motions.iter_mut().filter(|(label, _)| !measured.contains_key(label)) {
+        motion.explained = scene.explains(*label, motion);
+    }
+    (motions, contacts)
+}
+
+/// Root mean square by which the tool misses a point that is fixed on a part \[m\].
+fn miss_of(contact: &Contact, displacements: &[Pose]) -> f64 {
+    let points: Vec<Vector3<f64>> =
+        contact.track.iter().map(|(k, x, _)| displacements[*k].inverse().transform_point(x)).collect();
+    let count = points.len().max(1) as f64;
+    let mean = points.iter().sum::<Vector3<f64>>() / count;
+    (points.iter().map(|p| (p - mean).norm_squared()).sum::<f64>() / count).sqrt()
+}
+
+/// What a miss of the tool counts beside an excess.
+fn miss_cost(miss: f64) -> f64 {
+    0.05 * (miss / TOOL_EXPLAINED).min(20.0)
 }
 
 /// The motions of all parts with a model, but the root; `measured` are those that need no explanation.
-pub fn explain_window(scene: &Scene<'_>, measured: BTreeMap<Label, Motion>) -> BTreeMap<Label, Motion> {
-    let mut motions = measured;
+fn explain_window(scene: &Scene<'_>, measured: &BTreeMap<Label, Motion>) -> BTreeMap<Label, Motion> {
+    let mut motions = measured.clone();
     let mut open: Vec<Label> = Vec::new();
     let unknown: Vec<Label> = scene.models.keys().copied().filter(|l| !motions.contains_key(l)).collect();
     for label in unknown.into_iter().filter(|&label| Some(label) != scene.root) {
@@ -109,26 +209,42 @@ pub fn explain_window(scene: &Scene<'_>, measured: BTreeMap<Label, Motion>) -> B
             open.push(label);
         }
     }
+    let scene = &Scene { free: open.par_iter().map(|&label| (label, scene.free_track(label))).collect(), ..*scene };
+    let mut offers = Offers::default();
+    let mut order = Vec::new();
     while !open.is_empty() {
-        let mut best: Option<(f64, usize, Motion)> = None;
-        let offers: Vec<Option<Motion>> = open.par_iter().map(|&label| scene.best_motion(label, &motions)).collect();
-        for (index, (&label, offer)) in open.iter().zip(offers).enumerate() {
-            let Some(motion) = offer else { continue };
-            let score =
-                motion.excess + 0.05 * (scene.tool_miss(label, &motion.displacements) / TOOL_EXPLAINED).min(20.0);
-            if best.as_ref().is_none_or(|(other, _, _)| score < *other) {
-                best = Some((score, index, motion));
-            }
-        }
-        let Some((_, index, motion)) = best else { break };
+        scene.prepare(&open, &motions, &mut offers);
+        let best = open
+            .iter()
+            .enumerate()
+            .filter_map(|(index, &label)| Some((index, scene.best_motion(label, &motions, &offers)?)))
+            .min_by(|(_, a), (_, b)| a.score.total_cmp(&b.score));
+        let Some((index, motion)) = best else { break };
         let label = open.remove(index);
-        let still = scene.evaluate(label, |_| scene.start_of(label));
-        motions.insert(label, if scene.beats(label, &motion, &still) { motion } else { still });
+        motions.insert(label, scene.accepted(label, motion));
+        order.push(label);
     }
     for label in open {
         motions.insert(label, scene.evaluate(label, |_| scene.start_of(label)));
     }
+    // What was explained first did not know of what came after it.
+    for label in order {
+        scene.reconsider(label, &mut motions, &mut offers);
+    }
     motions
+}
+
+/// Whether a part's motion was explained by way of another's.
+fn depends(motions: &BTreeMap<Label, Motion>, label: Label, on: Label) -> bool {
+    let mut at = Some(label);
+    for _ in 0..=motions.len() {
+        match at {
+            Some(part) if part == on => return true,
+            Some(part) => at = motions.get(&part).and_then(|m| m.carrier),
+            None => return false,
+        }
+    }
+    true
 }
 
 impl Scene<'_> {
@@ -170,7 +286,8 @@ impl Scene<'_> {
                 // do not. Either may happen, so the smaller excess is taken.
                 let per_point = cost - baseline.cost;
                 let matched = (OUTLIER_COST - cost) * scan.len() as f64 / baseline.points.max(1.0);
-                per_point.min(OUTLIER_COST - baseline.cost - matched).max(-0.3)
+                let excess = per_point.min(OUTLIER_COST - baseline.cost - matched).max(-0.3);
+                excess + SEEN_THROUGH_COST * self.seen_through(label, k, d)
             })
             .collect();
         let mean = costs.iter().sum::<f64>() / costs.len().max(1) as f64;
@@ -181,17 +298,40 @@ impl Scene<'_> {
         let worst = worst.iter().sum::<f64>() / worst.len().max(1) as f64;
         let start = self.start_of(label);
         let moved = displacements.iter().any(|d| travel(model, &start, d) > 0.002);
-        Motion { displacements, moved, excess: mean.max(0.6 * worst), seed: None }
+        let excess = mean.max(0.6 * worst);
+        Motion { displacements, moved, excess, seed: None, explained: None, carrier: None, score: excess }
+    }
+
+    /// The share of rays through where the part's faces would be that ended behind them.
+    fn seen_through(&self, label: Label, frame: usize, displacement: &Pose) -> f64 {
+        let model = &self.models[&label];
+        if model.outlines.is_empty() {
+            return 0.0;
+        }
+        let others = self.frames[frame].scans.iter().filter(|(other, _)| **other != label);
+        let others = others.flat_map(|(_, scan)| scan).step_by(EVERY_RAY);
+        let near = rays_near(others, &displacement.transform_point(&model.centroid), model.reach());
+        let share = seen_through(model, self.scan(label, frame), (&near, EVERY_RAY), displacement);
+        ((share - WRONG_LABELS) / (1.0 - WRONG_LABELS)).max(0.0)
     }
 
     /// Root mean square by which the tool misses a contact point that is fixed on the part \[m\].
     fn tool_miss(&self, label: Label, displacements: &[Pose]) -> f64 {
-        let Some(contact) = self.contact(label) else { return 0.0 };
-        let points: Vec<Vector3<f64>> =
-            contact.track.iter().map(|(k, x, _)| displacements[*k].inverse().transform_point(x)).collect();
-        let count = points.len().max(1) as f64;
-        let mean = points.iter().sum::<Vector3<f64>>() / count;
-        (points.iter().map(|p| (p - mean).norm_squared()).sum::<f64>() / count).sqrt()
+        self.contact(label).map_or(0.0, |contact| miss_of(contact, displacements))
+    }
+
+    /// Whether a motion explains what was seen and felt of a part: new faces leave a high excess, so what
+    /// the tool goes along with counts as well.
+    fn explains(&self, label: Label, motion: &Motion) -> Option<bool> {
+        let held = self.contact(label).is_some() && motion.moved;
+        let felt = held && self.tool_miss(label, &motion.displacements) < TOOL_EXPLAINED;
+        if motion.excess < WELL_EXPLAINED || felt {
+            Some(true)
+        } else {
+            // Parts that open next to it change what is seen of a part at rest.
+            let most = if motion.moved { BADLY_EXPLAINED } else { 2.0 * BADLY_EXPLAINED };
+            (motion.excess > most).then_some(false)
+        }
     }
 
     /// Whether a motion explains a part clearly better than rest. A cost that stays high either way
@@ -201,65 +341,164 @@ impl Scene<'_> {
         let share = if self.contacts.iter().any(|c| c.label == label) { 0.3 } else { 0.5 };
         let seen = gain > EXPLAINED && gain > share * still.excess;
         let miss = self.tool_miss(label, &still.displacements);
-        let felt = miss > TOOL_EXPLAINED && self.tool_miss(label, &motion.displacements) < 0.5 * miss && gain > -0.2;
+        let felt = miss > TOOL_EXPLAINED
+            && self.tool_miss(label, &motion.displacements) < 0.5 * miss
+            && gain > -0.2 * (1.0 + still.excess);
         seen || felt
     }
 
-    fn best_motion(&self, label: Label, known: &BTreeMap<Label, Motion>) -> Option<Motion> {
+    /// Excess, misses of the tool, a jump at the start, and complexity.
+    fn score(&self, label: Label, motion: &Motion, complexity: f64) -> f64 {
+        let miss = self.tool_miss(label, &motion.displacements);
+        // A motion starts where the part was.
         let model = &self.models[&label];
-        let mut best = Best { motion: None, score: f64::INFINITY };
-        let mut known_joint = false;
-        let score = |motion: &Motion, complexity: f64| {
-            let miss = self.tool_miss(label, &motion.displacements);
-            // A motion starts where the part was.
-            let jump = motion.displacements.first().map_or(0.0, |d| travel(model, &self.start_of(label), d));
-            motion.excess + complexity + 0.05 * (miss / TOOL_EXPLAINED).min(20.0) + 0.05 * (jump / START_JUMP).min(20.0)
-        };
-        // Along the joint that is known.
-        if let Some(joint) = self.joints.iter().find(|joint| joint.child == label) {
-            let parent = joint.parent.map(|p| self.joints[p].child);
-            if let Some(parents) = self.parent_track(parent, known) {
-                let motion = self.along(label, &joint.screw(), joint.joint_type, &parents);
-                known_joint = self.touched_before.contains(&label);
-                best.offer(score(&motion, 0.0), motion);
-            }
+        let jump = motion.displacements.first().map_or(0.0, |d| travel(model, &self.start_of(label), d));
+        motion.excess + complexity + miss_cost(miss) + 0.05 * (jump / START_JUMP).min(20.0)
+    }
+
+    /// The part followed by registration alone, each frame from where it would have gone on to.
+    fn free_track(&self, label: Label) -> Vec<Pose> {
+        let model = &self.models[&label];
+        let settings = AlignmentSettings { gate: 0.04, ..AlignmentSettings::default() };
+        let r = model.radius;
+        let prior = Matrix6::from_diagonal(&(Vector6::new(r * r, r * r, r * r, 1.0, 1.0, 1.0) * 2.5e3));
+        let mut track: Vec<Pose> = Vec::with_capacity(self.frames.len());
+        for k in 0..self.frames.len() {
+            let last = track.last().copied().unwrap_or_else(|| self.start_of(label));
+            let scan = self.scan(label, k);
+            let ahead = match &track[..] {
+                [.., before, last] => *last * before.inverse() * *last,
+                _ => last,
+            };
+            let cost = |pose: &Pose| truncated_cost(model, scan, scan.len() / 150, pose);
+            let start = if cost(&ahead) < cost(&last) { ahead } else { last };
+            track.push(if scan.is_empty() {
+                last
+            } else {
+                align(model, scan, &start, &prior, &settings, 6).displacement
+            });
         }
-        let movers: Vec<Label> = known.iter().filter(|(_, m)| m.moved).map(|(l, _)| *l).collect();
-        for &carrier in &movers {
-            let track = &known[&carrier].displacements;
+        track
+    }
+
+    /// Along the known joint, or carried by what moves; and whether that is enough.
+    fn simple_motion(&self, label: Label, known: &BTreeMap<Label, Motion>, offers: &Offers) -> (Option<Motion>, bool) {
+        let mut best = Best { motion: None };
+        let mut known_joint = false;
+        if let Some(Some(motion)) = offers.along.get(&label) {
+            known_joint = self.touched_before.contains(&label);
+            best.offer(self.score(label, motion, 0.0), motion.clone());
+        }
+        for (&carrier, parent) in known.iter().filter(|(l, m)| **l != label && m.moved && !depends(known, **l, label)) {
+            let track = &parent.displacements;
             let fixed = track[0].inverse() * self.start_of(label);
             let motion = self.evaluate(label, |k| track[k] * fixed);
-            best.offer(score(&motion, 0.0), motion);
+            best.offer(self.score(label, &motion, 0.0), Motion { carrier: Some(carrier), ..motion });
         }
-        let still = self.evaluate(label, |_| self.start_of(label));
-        if let Some(motion) = &best.motion {
+        let settled = best.motion.as_ref().is_some_and(|motion| {
             let held = self.tool_miss(label, &motion.displacements) < 1.5 * TOOL_EXPLAINED;
-            if held && (known_joint || motion.excess < EXPLAINED || motion.excess < 0.3 * still.excess) {
-                return best.motion;
+            let still = self.evaluate(label, |_| self.start_of(label));
+            held && (known_joint || motion.excess < EXPLAINED || motion.excess < 0.3 * still.excess)
+        });
+        (best.motion, settled)
+    }
+
+    /// What a part may hang on: the world, what moves, and what was moved before.
+    fn possible_parents(&self, label: Label, known: &BTreeMap<Label, Motion>) -> Vec<Option<Label>> {
+        let displaced = |l: Label| travel(&self.models[&l], &Pose::identity(), &self.start_of(l)) > 0.005;
+        let others = known.iter().filter(|(l, m)| **l != label && (m.moved || displaced(**l)));
+        let others = others.map(|(l, _)| *l).filter(|l| !depends(known, *l, label));
+        [None].into_iter().chain(others.map(Some)).collect()
+    }
+
+    /// Finds what the best motions of these parts are chosen from.
+    fn prepare(&self, labels: &[Label], known: &BTreeMap<Label, Motion>, offers: &mut Offers) {
+        let missing: Vec<Label> = labels.iter().copied().filter(|l| !offers.along.contains_key(l)).collect();
+        let along: Vec<(Label, Option<Motion>)> = missing
+            .par_iter()
+            .filter_map(|&label| {
+                let joint = self.joints.iter().find(|joint| joint.child == label)?;
+                let parent = joint.parent.map(|p| self.joints[p].child);
+                let parents = self.parent_track(parent, known)?;
+                let motion = self.along(label, &joint.screw(), joint.joint_type, &parents);
+                Some((label, Some(Motion { carrier: parent, ..motion })))
+            })
+            .collect();
+        offers.along.extend(along);
+        let mut pairs: Vec<(Label, Option<Label>, usize)> = Vec::new();
+        for &label in labels {
+            let (best, settled) = self.simple_motion(label, known, offers);
+            if !settled {
+                let most = if best.is_some_and(|m| m.score < 2.0 * EXPLAINED) { 1 } else { 3 };
+                let parents = self.possible_parents(label, known);
+                pairs.extend(parents.into_iter().map(|parent| (label, parent, most)));
             }
         }
-        let mut parents: Vec<Option<Label>> = vec![None];
-        parents.extend(movers.iter().map(|l| Some(*l)));
-        parents.extend(
-            known
-                .iter()
-                .filter(|(l, m)| !m.moved && travel(&self.models[*l], &Pose::identity(), &self.start_of(**l)) > 0.005)
-                .map(|(l, _)| Some(*l)),
-        );
+        pairs.retain(|(label, parent, _)| !offers.refined.contains_key(&(*label, *parent)));
+        let refined: Vec<(_, Vec<Motion>)> = pairs
+            .par_iter()
+            .map(|&(label, parent, most)| {
+                let motions = self.parent_track(parent, known).map_or_else(Vec::new, |track| {
+                    let seeds = self.seeds(label, &self.models[&label], &track, most);
+                    seeds.iter().filter_map(|seed| self.refine(label, parent, seed, &track)).collect()
+                });
+                ((label, parent), motions)
+            })
+            .collect();
+        offers.refined.extend(refined);
+    }
+
+    /// The best of what was found for a part.
+    fn best_motion(&self, label: Label, known: &BTreeMap<Label, Motion>, offers: &Offers) -> Option<Motion> {
+        let (simple, settled) = self.simple_motion(label, known, offers);
+        if settled {
+            return simple;
+        }
+        let still = self.evaluate(label, |_| self.start_of(label));
+        let carried = simple.as_ref().map_or(still.excess, |m| m.excess.min(still.excess));
         // A part that nothing touches needs a better reason for a joint of its own: what it shows anew
         // must not pass for motion.
         let touched = self.contacts.iter().any(|c| c.label == label);
-        let carried = best.motion.as_ref().map_or(still.excess, |m| m.excess.min(still.excess));
-        let reluctance = 0.02 + if touched { 0.0 } else { 0.1 + 0.4 * carried.max(0.0) };
-        let most = if best.score < 2.0 * EXPLAINED { 2 } else { 4 };
-        for (rank, parent) in parents.iter().enumerate() {
-            let Some(track) = self.parent_track(*parent, known) else { continue };
-            for seed in self.seeds(label, model, &track, most) {
-                let Some(motion) = self.refine(label, *parent, &seed, &track) else { continue };
-                best.offer(score(&motion, reluctance + if rank > 0 { 0.02 } else { 0.0 }), motion);
+        let reluctance = 0.02 + if touched { 0.0 } else { 0.1 + (0.4 * carried.max(0.0)).min(MOST_RELUCTANCE) };
+        let mut best = Best { motion: simple };
+        for parent in self.possible_parents(label, known) {
+            for motion in offers.refined.get(&(label, parent)).into_iter().flatten() {
+                let complexity = reluctance + if parent.is_some() { 0.02 } else { 0.0 };
+                tracing::trace!(%label, ?parent, excess = motion.excess, miss = self.tool_miss(label, &motion.displacements), score = self.score(label, motion, complexity), seed = ?motion.seed, "offer");
+                best.offer(self.score(label, motion, complexity), motion.clone());
             }
         }
         best.motion
+    }
+
+    /// A motion, or rest if it does not explain clearly more, or the free track if nothing else does.
+    fn accepted(&self, label: Label, motion: Motion) -> Motion {
+        let still = self.evaluate(label, |_| self.start_of(label));
+        tracing::trace!(%label, excess = motion.excess, score = motion.score, seed = ?motion.seed, still = still.excess, still_miss = self.tool_miss(label, &still.displacements), free = self.free.get(&label).map(|t| self.evaluate(label, |k| t[k]).excess), "accept");
+        let motion = if self.beats(label, &motion, &still) { motion } else { still };
+        if motion.excess > UNEXPLAINED
+            && let Some(track) = self.free.get(&label)
+        {
+            let free = self.evaluate(label, |k| track[k]);
+            if free.excess < 0.4 * motion.excess {
+                return free;
+            }
+        }
+        motion
+    }
+
+    /// Explains a part again where all others are explained.
+    fn reconsider(&self, label: Label, motions: &mut BTreeMap<Label, Motion>, offers: &mut Offers) {
+        if motions[&label].excess < EXPLAINED && motions[&label].seed.is_none() {
+            return;
+        }
+        self.prepare(&[label], motions, offers);
+        let Some(motion) = self.best_motion(label, motions, offers) else { return };
+        if motion.score < motions[&label].score - RECONSIDERED {
+            let motion = self.accepted(label, motion);
+            motions.insert(label, motion);
+            offers.refined.retain(|(_, parent), _| *parent != Some(label));
+        }
     }
 
     /// Displacements of a parent through the window, if they are known.
@@ -309,7 +548,9 @@ impl Scene<'_> {
             let mut seeds: Vec<(AxisSeed, f64)> =
                 [fit_line(&track), fit_circle(&track)].into_iter().flatten().collect();
             seeds.sort_by(|a, b| a.1.total_cmp(&b.1));
-            return seeds.into_iter().map(|(seed, _)| seed).collect();
+            let mut seeds: Vec<AxisSeed> = seeds.into_iter().map(|(seed, _)| seed).collect();
+            seeds.extend(self.seeds_of_free_track(label, parents));
+            return seeds;
         }
         // Rank the shape's axes by the frames in which the part is furthest from where it started.
         let directions: Vec<Vector3<f64>> = Vec::new();
@@ -331,7 +572,35 @@ impl Scene<'_> {
             })
             .collect();
         ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
-        ranked.into_iter().take(most).map(|(_, seed)| seed).collect()
+        let followed = self.seeds_of_free_track(label, parents);
+        followed.into_iter().chain(ranked.into_iter().take(most).map(|(_, seed)| seed)).collect()
+    }
+
+    /// Axes of the motion that the free track shows relative to a parent.
+    fn seeds_of_free_track(&self, label: Label, parents: &[Pose]) -> Vec<AxisSeed> {
+        let Some(track) = self.free.get(&label) else { return Vec::new() };
+        let model = &self.models[&label];
+        let at = |k: usize| parents[k].inverse() * track[k];
+        let first = at(0);
+        let Some(last) =
+            (0..track.len()).map(at).max_by(|a, b| travel(model, &first, a).total_cmp(&travel(model, &first, b)))
+        else {
+            return Vec::new();
+        };
+        let twist = (last * first.inverse()).log();
+        let angular: Vector3<f64> = twist.fixed_rows::<3>(0).into();
+        let linear: Vector3<f64> = twist.fixed_rows::<3>(3).into();
+        let angle = angular.norm();
+        let shift = last.transform_point(&model.centroid) - first.transform_point(&model.centroid);
+        let mut seeds = Vec::new();
+        if angle > LEAST_TURN {
+            let direction = angular / angle;
+            seeds.push(AxisSeed { direction, point: Some(direction.cross(&linear) / angle) });
+        }
+        if shift.norm() > LEAST_SHIFT {
+            seeds.push(AxisSeed { direction: shift.normalize(), point: None });
+        }
+        seeds
     }
 
     /// Refines a seed on the points themselves, with the gate closing in.
@@ -363,14 +632,17 @@ impl Scene<'_> {
         // Faces that come into view match wrongly at first: where the tool is felt, it leads.
         let shared_error = if contact.is_some() { 0.010 } else { KinematicSettings::default().shared_error };
         let settings = KinematicSettings { steps: 8, shared_error, ..KinematicSettings::default() };
-        for gate in [0.05, 0.03, 0.02] {
+        for (gate, last) in [(0.05, false), (0.03, false), (0.02, true)] {
             let alignment = AlignmentSettings { gate, ..AlignmentSettings::default() };
             let screw = joint.screw();
             let relative: Vec<Pose> = positions.iter().map(|&q| screw.displacement(q)).collect();
             let poses = (0..self.frames.len())
                 .map(|k| {
                     let scan = self.scan(label, k);
-                    let measured = measure(model, scan, &(parents[k] * relative[k]), &alignment)?;
+                    let predicted = parents[k] * relative[k];
+                    // Outlines hold what is nearly in place.
+                    let past = if last { rays_past(&self.frames[k], label, model, &predicted) } else { Vec::new() };
+                    let measured = measure_past(model, scan, &past, &predicted, &alignment)?;
                     Some(PoseMeasurement { displacement: parents[k].inverse() * measured.displacement, ..measured })
                 })
                 .collect();
@@ -395,6 +667,7 @@ impl Scene<'_> {
         let mut motion = self.evaluate(label, |k| parents[k] * screw.displacement(positions[k]));
         let point = (joint_type == JointType::Revolute).then_some(joint.axis.point);
         motion.seed = Some((parent, AxisSeed { direction: joint.axis.direction, point }));
+        motion.carrier = parent;
         Some(motion)
     }
 }
@@ -402,13 +675,12 @@ impl Scene<'_> {
 /// The best of the motions offered so far.
 struct Best {
     motion: Option<Motion>,
-    score: f64,
 }
 
 impl Best {
     fn offer(&mut self, score: f64, motion: Motion) {
-        if score < self.score {
-            (self.score, self.motion) = (score, Some(motion));
+        if self.motion.as_ref().is_none_or(|best| score < best.score) {
+            self.motion = Some(Motion { score, ..motion });
         }
     }
 }
@@ -421,6 +693,17 @@ pub fn measure(
     predicted: &Pose,
     settings: &AlignmentSettings,
 ) -> Option<PoseMeasurement> {
+    measure_past(model, scan, &[], predicted, settings)
+}
+
+/// As `measure`, with the rays that go past the part: they show where its outline is not.
+fn measure_past(
+    model: &PartModel,
+    scan: &[ScanPoint],
+    past: &[ScanPoint],
+    predicted: &Pose,
+    settings: &AlignmentSettings,
+) -> Option<PoseMeasurement> {
     if scan.len() < FEWEST_POINTS {
         return None;
     }
@@ -429,13 +712,14 @@ pub fn measure(
         return None;
     }
     let whole = Quadratic { hessian: factor.hessian(), gradient: factor.gradient() };
-    Some(measurement_of(model, &whole, predicted))
+    Some(measurement_with_outline(model, &whole, scan, past, predicted))
 }
 
-/// As `measure`, apart for the faces of the first look and for those that came into view later.
+/// As `measure_past`, apart for the faces of the first look and for those that came into view later.
 pub fn measure_faces(
     model: &PartModel,
     scan: &[ScanPoint],
+    past: &[ScanPoint],
     predicted: &Pose,
     settings: &AlignmentSettings,
 ) -> [Option<PoseMeasurement>; 2] {
@@ -446,17 +730,50 @@ pub fn measure_faces(
     if factor.matched < FEWEST_POINTS {
         return [None; 2];
     }
-    factor.faces.map(|face| (face.hessian.trace() > 0.0).then(|| measurement_of(model, &face, predicted)))
+    let [first, later] = factor.faces;
+    [
+        (first.hessian.trace() > 0.0).then(|| measurement_with_outline(model, &first, scan, past, predicted)),
+        (later.hessian.trace() > 0.0).then(|| measurement_of(model, &later, predicted)),
+    ]
+}
+
+/// The points of a frame whose rays may pass a part.
+pub fn rays_past(frame: &Frame, label: Label, model: &PartModel, displacement: &Pose) -> Vec<ScanPoint> {
+    if model.outlines.is_empty() {
+        return Vec::new();
+    }
+    let others = frame.scans.iter().filter(|(other, _)| **other != label).flat_map(|(_, scan)| scan);
+    rays_near(others, &displacement.transform_point(&model.centroid), model.reach())
+}
+
+fn measurement_with_outline(
+    model: &PartModel,
+    factor: &Quadratic,
+    scan: &[ScanPoint],
+    past: &[ScanPoint],
+    predicted: &Pose,
+) -> PoseMeasurement {
+    let mut held = factor.cleaned(model.radius, FALSE_SHARE);
+    if !past.is_empty() {
+        let outline = outline_quadratic(&model.outlines, scan, past, predicted, &model.centroid, model.radius);
+        held.hessian += outline.hessian;
+        held.gradient += outline.gradient;
+    }
+    optimum(model, &held, predicted)
 }
 
 /// The pose measurement of a factor taken at `predicted`.
 pub fn measurement_of(model: &PartModel, factor: &Quadratic, predicted: &Pose) -> PoseMeasurement {
-    let information = factor.information(model.radius, FALSE_SHARE);
+    optimum(model, &factor.cleaned(model.radius, FALSE_SHARE), predicted)
+}
+
+fn optimum(model: &PartModel, held: &Quadratic, predicted: &Pose) -> PoseMeasurement {
+    let information = held.hessian;
     let weak =
         Vector6::new(model.radius, model.radius, model.radius, 1.0, 1.0, 1.0).map(|s| s * s / MEASURED_WITHIN.powi(2));
     let step = (information + Matrix6::from_diagonal(&weak))
         .cholesky()
-        .map_or_else(Vector6::zeros, |c| -c.solve(&factor.gradient));
+        .map_or_else(Vector6::zeros, |c| -c.solve(&held.gradient));
     let length = step.fixed_rows::<3>(0).norm() * model.radius + step.fixed_rows::<3>(3).norm();
     let step = if length > 3.0 * MEASURED_WITHIN { step * (3.0 * MEASURED_WITHIN / length) } else { step };
     let displacement = *predicted

@@ -1,12 +1,13 @@
 //! What has been learned of the object, window by window: the worker side of the pipeline.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 use nalgebra::{DMatrix, Vector3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::explain::{Baseline, Frame, Motion, Scene, explain_window, measure_faces, travel};
+use super::explain::{Baseline, Frame, Motion, Scene, explain_contacts, measure_faces, rays_past, travel};
 use super::keyframes::Keyframes;
 use super::poses::{POSED_RADIUS, PosedPart, measured_motion};
 use crate::geometry::{HullProperties, hull_properties};
@@ -19,7 +20,7 @@ use crate::model::{
 };
 use crate::model::{DynamicsInput, DynamicsLearner, DynamicsPosterior, WindowInference};
 use crate::registration::{
-    AlignmentSettings, PartModel, ScanPoint, Surfel, SurfelAccumulator, fit_circle, fit_line, truncated_cost,
+    AlignmentSettings, PartModel, ScanPoint, Surfel, SurfelAccumulator, fit_circle, fit_line, rays_near, truncated_cost,
 };
 use crate::structure::TreeDistribution;
 use crate::types::posterior::WindowRecord;
@@ -38,6 +39,14 @@ const CONTACT_GAP: f64 = 0.03;
 const CONTACT_GAP_SIGMA: f64 = 0.02;
 /// Log prior lost at most by parts that are far apart \[nats\].
 const FARTHEST_PENALTY: f64 = 40.0;
+/// A window that is explained well counts this much against one that is not.
+const WELL_AGAINST_BADLY: f64 = 20.0;
+/// The least probability that a part's evidence stands on a wrong explanation.
+const LEAST_DOUBT: f64 = 1e-3;
+/// Windows whose frames are kept for measuring again: about 7 MB each.
+const KEPT_FRAMES: usize = 8;
+/// A part is measured again where a later fit has moved it by more than this \[m\].
+const MEASURED_AGAIN: f64 = 0.002;
 
 /// One closed window, ready to be learned.
 #[derive(Clone, Debug, Default)]
@@ -65,7 +74,7 @@ impl WindowJob {
 pub struct ParentEvidence {
     /// `None`: whatever never moved.
     pub parent: Option<Label>,
-    /// Log evidence of rigid, prismatic, revolute.
+    /// Log evidence of rigid, prismatic, revolute, given how the windows were explained.
     pub log_evidence: [f64; 3],
     /// The fits of the moving types.
     pub fits: [Option<EdgeFit>; 3],
@@ -89,6 +98,20 @@ impl ParentEvidence {
     }
 }
 
+/// In how many windows a part's motion was explained, and in how many it was not.
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
+struct Explained {
+    well: f64,
+    badly: f64,
+}
+
+impl Explained {
+    /// Probability that the evidence stands on a wrong explanation.
+    fn doubt(&self) -> f64 {
+        (self.badly / (self.badly + WELL_AGAINST_BADLY * self.well)).clamp(LEAST_DOUBT, 1.0)
+    }
+}
+
 /// Kinematic state of everything learned.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Learner {
@@ -109,10 +132,19 @@ pub struct Learner {
     /// Reference models; saved apart.
     #[serde(skip)]
     pub models: BTreeMap<Label, PartModel>,
-    /// Surfels of the first look.
-    pub(super) reference: BTreeMap<Label, Vec<Surfel>>,
+    /// Models of the first look.
+    pub(super) reference: BTreeMap<Label, PartModel>,
+    /// How well each part's motions were explained.
+    explained: BTreeMap<Label, Explained>,
     /// Scans that the models grow from.
     pub(super) keyframes: BTreeMap<Label, Keyframes>,
+    /// Frames by window, measured again where a later fit has a part elsewhere. Empty where forgotten;
+    /// not saved.
+    #[serde(skip)]
+    pub(super) kept: Vec<Arc<Vec<Frame>>>,
+    /// Where each part was when each window's scans were measured last.
+    #[serde(skip)]
+    pub(super) measured_at: BTreeMap<Label, Vec<Vec<Pose>>>,
     /// What scans cost at known poses.
     pub baselines: BTreeMap<Label, Baseline>,
     /// Parts that the tool has moved.
@@ -151,10 +183,9 @@ pub struct Learner {
 impl Learner {
     /// Nothing learned yet: models from the scans accumulated at the reference configuration.
     pub fn new(root: Label, use_tool: bool, accumulators: BTreeMap<Label, SurfelAccumulator>) -> Self {
-        let reference: BTreeMap<Label, Vec<Surfel>> =
-            accumulators.iter().map(|(label, a)| (*label, a.surfels())).collect();
+        let reference: BTreeMap<Label, PartModel> =
+            accumulators.iter().filter_map(|(label, a)| Some((*label, PartModel::new(&a.surfels())?))).collect();
         let gaps = surface_gaps(&reference);
-        let models = reference.iter().filter_map(|(label, s)| Some((*label, PartModel::new(s, &[])?))).collect();
         Self {
             root,
             sampling: None,
@@ -162,12 +193,15 @@ impl Learner {
             root_is_given: true,
             world: None,
             use_tool,
-            models,
+            models: reference.clone(),
             reference,
             keyframes: BTreeMap::new(),
             touched: BTreeSet::new(),
+            explained: BTreeMap::new(),
             moved_before: BTreeSet::new(),
             kept_windows: usize::MAX,
+            kept: Vec::new(),
+            measured_at: BTreeMap::new(),
             gaps,
             baselines: BTreeMap::new(),
             displacements: BTreeMap::new(),
@@ -230,6 +264,11 @@ impl Learner {
         self.fit.as_ref().map_or(&[], |fit| &fit.joints)
     }
 
+    /// Probability that a part's evidence stands on a wrong explanation of its windows.
+    pub fn doubt(&self, label: Label) -> f64 {
+        self.explained.get(&label).copied().unwrap_or_default().doubt()
+    }
+
     /// Least and greatest position of each joint of the likeliest tree in the windows learned, by child
     /// \[m or rad\].
     pub fn ranges_seen(&self) -> BTreeMap<Label, (f64, f64)> {
@@ -243,6 +282,20 @@ impl Learner {
 
     /// Sets the baselines that are not known yet from frames at the reference configuration.
     pub fn calibrate(&mut self, frames: &[Frame]) {
+        for (label, model) in &mut self.reference {
+            if self.baselines.contains_key(label) {
+                continue;
+            }
+            let scans: Vec<(&[ScanPoint], Vec<ScanPoint>)> = frames
+                .iter()
+                .filter_map(|frame| {
+                    let others = frame.scans.iter().filter(|(other, _)| *other != label).flat_map(|(_, scan)| scan);
+                    Some((frame.scans.get(label)?.as_slice(), rays_near(others, &model.centroid, model.reach())))
+                })
+                .collect();
+            model.calibrate_outlines(&scans);
+            self.models.insert(*label, model.clone());
+        }
         for (label, model) in &self.models {
             if self.baselines.contains_key(label) {
                 continue;
@@ -276,6 +329,7 @@ impl Learner {
             touched_before: &self.touched,
             root: Some(self.root),
             use_tool: self.use_tool,
+            free: BTreeMap::new(),
         }
     }
 
@@ -285,13 +339,23 @@ impl Learner {
         let (measured, poses) = self.posed_motions(job);
         let scene = self.scene(job);
         let doubted = !self.root_is_given && !measured.contains_key(&self.root) && scene.has_left(self.root);
-        let motions = explain_window(&Scene { root: (!doubted).then_some(self.root), ..scene }, measured);
-        let direct = poses.keys().filter_map(|label| Some((*label, self.posed.get(label)?.information)));
+        let scene = Scene { root: (!doubted).then_some(self.root), ..scene };
+        let bound = job.wrenches.iter().any(|wrench| wrench.part.is_some());
+        let (motions, contacts) = explain_contacts(&scene, &measured, !bound);
+        let direct = poses.keys().filter_map(|label| Some((*label, self.posed.get(label)?.information))).collect();
+        for (label, motion) in &motions {
+            let explained = self.explained.entry(*label).or_default();
+            match motion.explained {
+                Some(true) if motion.moved => explained.well += 1.0,
+                Some(false) => explained.badly += 1.0,
+                _ => {}
+            }
+        }
         let observations = WindowObservations {
             times_s: job.frames.iter().map(|f| f.time_s).collect(),
-            contacts: if self.use_tool { job.contacts.clone() } else { Vec::new() },
+            contacts: if self.use_tool { contacts.clone() } else { Vec::new() },
             wrenches: job.wrenches.clone(),
-            direct: direct.collect(),
+            direct,
             poses,
             ..WindowObservations::default()
         };
@@ -299,21 +363,24 @@ impl Learner {
             tracing::debug!(%label, moved = motion.moved, excess = motion.excess, seed = ?motion.seed, "motion");
         }
         let moved = |label: &Label| motions.get(label).is_some_and(|m| m.moved);
-        self.touched.extend(job.contacts.iter().map(|c| c.label).filter(moved));
+        self.touched.extend(contacts.iter().map(|c| c.label).filter(moved));
         for (label, motion) in &motions {
             self.tracks.entry(*label).or_default().push(motion.displacements.clone());
         }
         self.windows.push(observations);
         self.grow(job, &motions);
+        let last = self.windows.len() - 1;
         for label in motions.keys() {
-            self.measure(*label, &job.frames);
+            self.measure(*label, last, &job.frames);
         }
+        self.keep(job);
         self.weigh_edges(&motions);
         self.fit_joints();
         self.rebuild_models();
         let labels: Vec<Label> = self.joints().iter().map(|j| j.child).collect();
         for label in labels {
-            self.measure(label, &job.frames);
+            self.measure(label, last, &job.frames);
+            self.measure_again(label);
         }
         self.fit_joints();
         for (label, tracks) in &self.tracks {
@@ -322,12 +389,12 @@ impl Learner {
             }
         }
         self.choose_root();
-        self.learn_dynamics(job);
+        self.learn_dynamics(job, &contacts);
         self.record(job);
         self.retire();
     }
 
-    fn learn_dynamics(&mut self, job: &WindowJob) {
+    fn learn_dynamics(&mut self, job: &WindowJob, contacts: &[Contact]) {
         for (label, model) in &self.models {
             let points: Vec<Vector3<f64>> = model.surfels.iter().map(|s| s.point).collect();
             if let Some(hull) = hull_properties(&points, None) {
@@ -336,18 +403,13 @@ impl Learner {
         }
         let Some(fit) = &self.fit else {
             self.inferences.push(WindowInference::default());
-            self.dynamics.keep_window(&job.contacts);
+            self.dynamics.keep_window(contacts);
             return;
         };
         self.zero = Some(job.zero);
         let windows: Vec<&WindowObservations> = self.windows.iter().collect();
-        let input = DynamicsInput {
-            windows: &windows,
-            contacts: &job.contacts,
-            zero: job.zero,
-            parts: &self.hulls,
-            use_tool: self.use_tool,
-        };
+        let input =
+            DynamicsInput { windows: &windows, contacts, zero: job.zero, parts: &self.hulls, use_tool: self.use_tool };
         self.inferences.push(self.dynamics.learn_window(fit, &input));
     }
 
@@ -371,24 +433,56 @@ impl Learner {
         }
     }
 
-    /// Measures a part's poses in the last window, about its track.
-    fn measure(&mut self, label: Label, frames: &[Frame]) {
+    /// Measures a part's poses in a window, about its track.
+    fn measure(&mut self, label: Label, window: usize, frames: &[Frame]) {
         if self.posed.contains_key(&label) {
             return;
         }
         let settings = AlignmentSettings { gate: 0.02, ..AlignmentSettings::default() };
-        let Some(track) = self.tracks.get(&label).and_then(|t| t.last()) else { return };
+        let Some(track) = self.tracks.get(&label).and_then(|t| t.get(window)) else { return };
         let faces: Vec<_> = frames
             .iter()
             .zip(track)
             .map(|(frame, displacement)| match (self.models.get(&label), frame.scans.get(&label)) {
-                (Some(model), Some(scan)) => measure_faces(model, scan, displacement, &settings),
+                (Some(model), Some(scan)) => {
+                    let past = rays_past(frame, label, model, displacement);
+                    measure_faces(model, scan, &past, displacement, &settings)
+                }
                 _ => [None; 2],
             })
             .collect();
-        if let Some(window) = self.windows.last_mut() {
+        let measured_at = self.measured_at.entry(label).or_default();
+        measured_at.resize(measured_at.len().max(window + 1), Vec::new());
+        measured_at[window].clone_from(track);
+        if let Some(window) = self.windows.get_mut(window) {
             window.poses.insert(label, faces.iter().map(|f| f[0]).collect());
             window.later_faces.insert(label, faces.iter().map(|f| f[1]).collect());
+        }
+    }
+
+    /// Keeps the window's frames, and forgets those of the oldest window beyond what is kept.
+    fn keep(&mut self, job: &WindowJob) {
+        // Frames of windows that were saved and loaded are gone.
+        self.kept.resize(self.windows.len().saturating_sub(1), Arc::default());
+        self.kept.push(Arc::new(job.frames.clone()));
+        if let Some(forgotten) = self.kept.len().checked_sub(KEPT_FRAMES + 1) {
+            self.kept[forgotten] = Arc::default();
+        }
+    }
+
+    /// Measures a part again in the earlier windows where the fit has moved it since.
+    fn measure_again(&mut self, label: Label) {
+        let Some(model) = self.models.get(&label) else { return };
+        let elsewhere: Vec<usize> = (0..self.windows.len() - 1)
+            .filter(|&w| self.kept[w].iter().any(|frame| frame.scans.contains_key(&label)))
+            .filter(|&w| {
+                let Some(before) = self.measured_at.get(&label).and_then(|m| m.get(w)) else { return false };
+                before.iter().zip(&self.tracks[&label][w]).any(|(old, new)| travel(model, old, new) > MEASURED_AGAIN)
+            })
+            .collect();
+        for w in elsewhere {
+            let frames = Arc::clone(&self.kept[w]);
+            self.measure(label, w, &frames);
         }
     }
 
@@ -407,11 +501,11 @@ impl Learner {
     }
 
     /// A part that is met later than the others, with its surfels at the reference configuration.
-    pub(super) fn add_part(&mut self, label: Label, surfels: Vec<Surfel>, model: PartModel) {
+    pub(super) fn add_part(&mut self, label: Label, model: PartModel) {
         let rested = self.windows.iter().map(|window| vec![Pose::identity(); window.times_s.len()]).collect();
         self.tracks.insert(label, rested);
-        self.models.insert(label, model);
-        self.reference.insert(label, surfels);
+        self.models.insert(label, model.clone());
+        self.reference.insert(label, model);
         self.gaps = surface_gaps(&self.reference);
     }
 
@@ -427,7 +521,7 @@ impl Learner {
             let all = self.tracks.get(label).into_iter().flatten().flatten();
             all.map(|displacement| travel(model, &Pose::identity(), displacement)).fold(0.0, f64::max)
         };
-        let size = |label: &Label| self.reference.get(label).map_or(0, Vec::len);
+        let size = |label: &Label| self.reference.get(label).map_or(0, |model| model.surfels.len());
         let still = self.models.keys().filter(|label| !self.ever_moved(**label));
         let largest = still.max_by_key(|label| (size(label), std::cmp::Reverse(**label)));
         let least_far = || self.models.keys().min_by(|a, b| farthest(a).total_cmp(&farthest(b)));
@@ -464,7 +558,7 @@ impl Learner {
         let part = self.part(child);
         let carrier = parent.map(|p| self.part(p));
         let carrier = carrier.as_ref().map(|part| (part, self.tracks[&part.label].as_slice()));
-        let relative = relative_windows(&part, carrier, &windows);
+        let relative = relative_windows(&part, &self.tracks[&child], carrier, &windows);
         let resting = self.resting_windows(child, parent);
         let (rigid, rigid_by_window) = rigid_evidence(&part, &relative, &self.settings);
         let past = self.past_evidence(child, parent);
@@ -737,8 +831,7 @@ impl Learner {
             .map(|(label, keyframes)| {
                 let tracks = self.tracks.get(label).map_or(&[][..], Vec::as_slice);
                 let later = keyframes.accumulated(tracks);
-                let reference = self.reference.get(label).map_or(&[][..], Vec::as_slice);
-                (*label, PartModel::new(reference, &later.surfels()))
+                (*label, self.reference.get(label).map(|first| first.grown(&later.surfels())))
             })
             .collect();
         self.models.extend(rebuilt.into_iter().filter_map(|(label, model)| Some((label, model?))));
@@ -760,10 +853,12 @@ fn same_axis(first: &Axis, second: &Axis, center: &Vector3<f64>, joint_type: Joi
 }
 
 /// Smallest distance between the surfels of each pair of parts \[m\].
-fn surface_gaps(parts: &BTreeMap<Label, Vec<Surfel>>) -> BTreeMap<(Label, Label), f64> {
+fn surface_gaps(parts: &BTreeMap<Label, PartModel>) -> BTreeMap<(Label, Label), f64> {
     let mut gaps = BTreeMap::new();
-    for (first, surfels) in parts {
-        for (second, others) in parts.range((std::ops::Bound::Excluded(*first), std::ops::Bound::Unbounded)) {
+    for (first, PartModel { surfels, .. }) in parts {
+        for (second, PartModel { surfels: others, .. }) in
+            parts.range((std::ops::Bound::Excluded(*first), std::ops::Bound::Unbounded))
+        {
             let nearest =
                 |s: &Surfel| others.iter().map(|o| (o.point - s.point).norm_squared()).fold(f64::INFINITY, f64::min);
             let every = (surfels.len() / 400).max(1);

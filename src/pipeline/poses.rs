@@ -353,7 +353,7 @@ pub fn measured_motion(start: &Pose, center: &Vector3<f64>, measured: &[Option<P
         if furthest < RESTS_WITHIN || (mean < 12.0 && misses.iter().all(|(_, score)| *score < 2.0 * MOTION_SCORE)) {
             let moved = away(start, &PoseMeasurement { displacement: place, information: Matrix6::identity() }).0;
             let displacements = vec![place; measured.len()];
-            return Motion { displacements, moved: moved > MOTION_TRAVEL, excess: 0.0, seed: None };
+            return Motion::measured(displacements, moved > MOTION_TRAVEL);
         }
     }
     let mut last = seen.first().map_or(*start, |m| m.displacement);
@@ -361,7 +361,7 @@ pub fn measured_motion(start: &Pose, center: &Vector3<f64>, measured: &[Option<P
         last = m.map_or(last, |m| m.displacement);
         last
     });
-    Motion { displacements: displacements.collect(), moved: true, excess: 0.0, seed: None }
+    Motion::measured(displacements.collect(), true)
 }
 
 #[cfg(test)]

@@ -148,8 +148,10 @@ fn edges(root: Label, labels: &[Label], known: Option<Known<'_>>) -> Vec<EdgePos
     let Ok(trees) = TreeDistribution::new(&log_weights) else { return Vec::new() };
     let mut found = Vec::new();
     for (j, child) in nodes.iter().enumerate().skip(1) {
+        let doubt = evidence(*child).map_or(0.0, |_| known.map_or(0.0, |known| known.learner.doubt(*child)));
         for (i, parent) in nodes.iter().enumerate() {
-            let probability = trees.edge_marginals()[(i, j)];
+            let open = doubt / (nodes.len() - 1) as f64;
+            let probability = (1.0 - doubt) * trees.edge_marginals()[(i, j)] + open;
             if i == j || probability < ObjectPosterior::LEAST_PROBABILITY {
                 continue;
             }
@@ -182,7 +184,10 @@ fn edge(
     if let Some(option) = option {
         let total = log_sum(&option.log_evidence);
         let [rigid, prismatic, revolute] = option.log_evidence.map(|e| (e - total).exp());
-        joint_type = JointTypeProbabilities { rigid, prismatic, revolute };
+        let doubt = known.map_or(0.0, |known| known.learner.doubt(child));
+        let mixed = |p: f64| (1.0 - doubt) * p + doubt / 3.0;
+        joint_type =
+            JointTypeProbabilities { rigid: mixed(rigid), prismatic: mixed(prismatic), revolute: mixed(revolute) };
     }
     let fitted = |joint_type| fitted_axis(option?, known?.learner, child, joint_type);
     let revolute = fitted(JointType::Revolute).map(|(axis, covariance)| RevoluteAxis {

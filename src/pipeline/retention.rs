@@ -92,6 +92,8 @@ impl Learner {
             drop_at(&mut fit.window_information, window);
             fit.moves.iter_mut().for_each(|moves| drop_at(moves, window));
         }
+        drop_at(&mut self.kept, window);
+        self.measured_at.values_mut().for_each(|measured| drop_at(measured, window));
         self.windows.remove(window);
     }
 

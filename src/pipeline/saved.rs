@@ -188,11 +188,11 @@ impl Pipeline {
 impl Learner {
     /// The models, which are not saved: their faces of the first look are, and those of later.
     fn restore_models(&mut self, grown: &BTreeMap<Label, Vec<Surfel>>) {
-        let none = Vec::new();
-        let model = |(label, first): (&Label, &Vec<Surfel>)| {
-            Some((*label, PartModel::grown(first, grown.get(label).unwrap_or(&none))?))
+        let model = |(label, first): (&Label, &PartModel)| match grown.get(label) {
+            Some(grown) if !grown.is_empty() => (*label, first.with(grown)),
+            _ => (*label, first.clone()),
         };
-        self.models = self.reference.iter().filter_map(model).collect();
+        self.models = self.reference.iter().map(model).collect();
         let frame = |part: &PosedPart| PartModel::of_frame(part.world_from_frame.translation, POSED_RADIUS);
         self.models.extend(self.posed.iter().map(|(label, part)| (*label, frame(part))));
     }
@@ -243,9 +243,9 @@ impl Learner {
             }
         }
         for (label, accumulator) in accumulators {
-            let surfels = accumulator.surfels();
-            let Some(model) = PartModel::new(&surfels, &[]) else { continue };
-            self.add_part(label, surfels, model);
+            if let Some(model) = PartModel::new(&accumulator.surfels()) {
+                self.add_part(label, model);
+            }
         }
         self.calibrate(frames);
     }

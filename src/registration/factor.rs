@@ -66,18 +66,33 @@ impl PoseFactor {
 }
 
 impl Quadratic {
-    /// The information that the scan holds once what rough normals pretend to hold is taken off.
-    ///
-    /// Rotations are scaled by the model's `radius` \[m\] and each eigenvalue λ becomes
-    /// max(λ − `false_share` · λ_max, 0).
-    pub fn information(&self, radius: f64, false_share: f64) -> Matrix6<f64> {
+    /// What is left once what rough normals pretend to hold is taken off: each eigenvalue λ becomes
+    /// max(λ − `false_share` · λ_max, 0), rotations scaled by the model's `radius` \[m\].
+    pub fn cleaned(&self, radius: f64, false_share: f64) -> Self {
+        self.reshaped(radius, |value, most| (value - false_share * most).max(0.0))
+    }
+
+    /// This with an error of its own that all points share \[m\].
+    pub fn bounded(&self, radius: f64, shared_error: f64) -> Self {
+        self.reshaped(radius, |value, _| if value > 0.0 { 1.0 / (1.0 / value + shared_error.powi(2)) } else { 0.0 })
+    }
+
+    /// Gives every eigenvalue a new value by itself and the largest; where the optimum is stays.
+    fn reshaped(&self, radius: f64, value: impl Fn(f64, f64) -> f64) -> Self {
         let scale = Vector6::new(radius, radius, radius, 1.0, 1.0, 1.0);
         let scaled = Matrix6::from_fn(|i, j| self.hessian[(i, j)] / (scale[i] * scale[j]));
         let mut eigen = scaled.symmetric_eigen();
-        let off = false_share * eigen.eigenvalues.max();
-        eigen.eigenvalues.apply(|x| *x = (*x - off).max(0.0));
-        let clean = eigen.recompose();
-        Matrix6::from_fn(|i, j| clean[(i, j)] * scale[i] * scale[j])
+        let most = eigen.eigenvalues.max();
+        let mut pull = eigen.eigenvectors.transpose() * self.gradient.component_div(&scale);
+        for i in 0..6 {
+            let before = eigen.eigenvalues[i];
+            let after = value(before, most);
+            pull[i] *= if before > 0.0 { after / before } else { 0.0 };
+            eigen.eigenvalues[i] = after;
+        }
+        let gradient = (eigen.eigenvectors * pull).component_mul(&scale);
+        let reshaped = eigen.recompose();
+        Self { hessian: Matrix6::from_fn(|i, j| reshaped[(i, j)] * scale[i] * scale[j]), gradient }
     }
 }
 

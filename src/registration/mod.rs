@@ -9,6 +9,7 @@ mod align;
 mod articulated;
 mod factor;
 mod field;
+mod outline;
 mod seeds;
 mod surfels;
 
@@ -16,6 +17,7 @@ pub use align::{Alignment, align};
 pub use articulated::{JointFrame, JointPath, search_path};
 pub use factor::{AlignmentSettings, OUTLIER_COST, PoseFactor, Quadratic, pose_factor, truncated_cost};
 pub use field::NearestField;
+pub use outline::{Outline, outline_quadratic, rays_near, seen_through};
 pub use seeds::{AxisSeed, fit_circle, fit_line, geometric_seeds};
 pub use surfels::{PartModel, Surfel, SurfelAccumulator};
 

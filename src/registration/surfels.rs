@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::ScanPoint;
 use super::field::NearestField;
+use super::outline::Outline;
 use crate::math::Pose;
 
 /// Edge of the averaging voxels \[m\].
@@ -125,25 +126,18 @@ impl SurfelAccumulator {
     }
 
     fn surfels_of_side(&self, side: u8, view: Option<&Vector3<f64>>, least: f64) -> Vec<Surfel> {
-        let reach = (NORMAL_RADIUS / VOXEL).ceil() as i32;
         let mut surfels = Vec::new();
-        let range = (side, [i32::MIN; 3])..=(side, [i32::MAX; 3]);
-        for (&(_, key), voxel) in self.voxels.range(range).filter(|(_, v)| v.count >= least) {
-            let center = voxel.sum / voxel.count;
+        let voxels = SideVoxels::new(self.voxels.range((side, [i32::MIN; 3])..=(side, [i32::MAX; 3])), least);
+        for (key, center, _) in &voxels.0 {
+            let center = *center;
             let mut count = 0.0;
             let mut sum = Vector3::zeros();
             let mut outer = Matrix3::zeros();
-            for dx in -reach..=reach {
-                for dy in -reach..=reach {
-                    let low = (side, [key[0] + dx, key[1] + dy, key[2] - reach]);
-                    let high = (side, [key[0] + dx, key[1] + dy, key[2] + reach]);
-                    for neighbour in self.voxels.range(low..=high).map(|(_, v)| v).filter(|v| v.count >= least) {
-                        if (neighbour.sum / neighbour.count - center).norm() <= NORMAL_RADIUS {
-                            count += neighbour.count;
-                            sum += neighbour.sum;
-                            outer += neighbour.outer;
-                        }
-                    }
+            for (_, mean, neighbour) in voxels.around(*key) {
+                if (mean - center).norm_squared() <= NORMAL_RADIUS * NORMAL_RADIUS {
+                    count += neighbour.count;
+                    sum += neighbour.sum;
+                    outer += neighbour.outer;
                 }
             }
             if count < 8.0 {
@@ -170,6 +164,27 @@ impl SurfelAccumulator {
             });
         }
         surfels
+    }
+}
+
+/// The voxels of one side: key, mean position \[m\] and sums, in the order of their keys.
+struct SideVoxels<'a>(Vec<([i32; 3], Vector3<f64>, &'a VoxelSum)>);
+
+impl<'a> SideVoxels<'a> {
+    fn new(range: impl Iterator<Item = (&'a (u8, [i32; 3]), &'a VoxelSum)>, least: f64) -> Self {
+        Self(range.filter(|(_, v)| v.count >= least).map(|(&(_, key), v)| (key, v.sum / v.count, v)).collect())
+    }
+
+    /// The voxels in the cube of the normals' radius around a key, in the order of their keys.
+    fn around(&self, key: [i32; 3]) -> impl Iterator<Item = &([i32; 3], Vector3<f64>, &'a VoxelSum)> {
+        let reach = (NORMAL_RADIUS / VOXEL).ceil() as i32;
+        let near = move |x: i32, middle: i32| x.abs_diff(middle) <= reach.unsigned_abs();
+        (key[0].saturating_sub(reach)..=key[0].saturating_add(reach))
+            .flat_map(move |x| {
+                let from = self.0.partition_point(|(k, ..)| [k[0], k[1]] < [x, key[1].saturating_sub(reach)]);
+                self.0[from..].iter().take_while(move |(k, ..)| k[0] == x && (k[1] <= key[1] || near(k[1], key[1])))
+            })
+            .filter(move |(k, ..)| near(k[2], key[2]))
     }
 }
 
@@ -253,7 +268,8 @@ fn fit_plane(surfels: &[Surfel], members: &[usize]) -> (Vector3<f64>, Vector3<f6
 }
 
 /// A part's surfels with a nearest-surfel look-up, at the reference configuration.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(from = "PlainModel")]
 pub struct PartModel {
     /// The surfels.
     pub surfels: Vec<Surfel>,
@@ -261,17 +277,37 @@ pub struct PartModel {
     pub centroid: Vector3<f64>,
     /// Root-mean-square distance from the centroid \[m\]: scales rotations to lengths.
     pub radius: f64,
+    /// Outlines of its flat faces at the first look, once they are calibrated.
+    pub outlines: Vec<Outline>,
+    #[serde(skip)]
     pub(super) field: NearestField,
 }
 
+/// A model without the look-up, as it is saved.
+#[derive(Deserialize)]
+struct PlainModel {
+    surfels: Vec<Surfel>,
+    centroid: Vector3<f64>,
+    radius: f64,
+    outlines: Vec<Outline>,
+}
+
+impl From<PlainModel> for PartModel {
+    fn from(PlainModel { surfels, centroid, radius, outlines }: PlainModel) -> Self {
+        let field = NearestField::new(&surfels);
+        Self { surfels, centroid, radius, outlines, field }
+    }
+}
+
 impl PartModel {
-    /// A model of surfels seen at the reference configuration, and of those that came into view
-    /// later where the first have none. `None` with too few of the first.
-    pub fn new(reference: &[Surfel], later: &[Surfel]) -> Option<Self> {
-        if reference.len() < FEWEST_SURFELS {
-            return None;
-        }
-        let first = Self::of(reference.to_vec());
+    /// A model of the surfels seen at the reference configuration; `None` with too few of them.
+    pub fn new(reference: &[Surfel]) -> Option<Self> {
+        (reference.len() >= FEWEST_SURFELS).then(|| Self::of(reference.to_vec()))
+    }
+
+    /// This model of the first look, with the surfels that came into view later where it has none.
+    pub fn grown(&self, later: &[Surfel]) -> Self {
+        let first = self;
         let new_face = |surfel: &&Surfel| {
             first.field.nearest(&surfel.point).into_iter().flatten().all(|index| {
                 let near = &first.surfels[index as usize];
@@ -280,25 +316,22 @@ impl PartModel {
             })
         };
         let grown: Vec<Surfel> = later.iter().filter(new_face).map(|s| Surfel { grown: true, ..*s }).collect();
-        Some(first.with(reference, &grown))
-    }
-
-    /// The model of surfels of the first look and of those that were taken for new faces.
-    pub fn grown(reference: &[Surfel], grown: &[Surfel]) -> Option<Self> {
-        (reference.len() >= FEWEST_SURFELS).then(|| Self::of(reference.to_vec()).with(reference, grown))
-    }
-
-    fn with(self, reference: &[Surfel], grown: &[Surfel]) -> Self {
         if grown.is_empty() {
-            return self;
+            return first.clone();
         }
-        let (centroid, radius) = (self.centroid, self.radius);
-        Self { centroid, radius, ..Self::of([reference, grown].concat()) }
+        first.with(&grown)
+    }
+
+    /// This model of the first look with surfels that were taken for new faces.
+    pub fn with(&self, grown: &[Surfel]) -> Self {
+        let (centroid, radius, outlines) = (self.centroid, self.radius, self.outlines.clone());
+        Self { centroid, radius, outlines, ..Self::of([self.surfels.as_slice(), grown].concat()) }
     }
 
     /// A part of which only a frame's pose is measured: nothing to register, \[m\].
     pub fn of_frame(origin: Vector3<f64>, radius: f64) -> Self {
-        Self { surfels: Vec::new(), centroid: origin, radius, field: NearestField::new(&[]) }
+        let field = NearestField::new(&[]);
+        Self { surfels: Vec::new(), centroid: origin, radius, outlines: Vec::new(), field }
     }
 
     fn of(surfels: Vec<Surfel>) -> Self {
@@ -306,7 +339,30 @@ impl PartModel {
         let centroid = surfels.iter().map(|s| s.point).sum::<Vector3<f64>>() / count;
         let variance = surfels.iter().map(|s| (s.point - centroid).norm_squared()).sum::<f64>() / count;
         let field = NearestField::new(&surfels);
-        Self { surfels, centroid, radius: variance.sqrt().max(0.02), field }
+        Self { surfels, centroid, radius: variance.sqrt().max(0.02), outlines: Vec::new(), field }
+    }
+
+    /// Finds the outlines of the flat faces from scans at the reference configuration: the part's points
+    /// and those of all others, by frame.
+    pub fn calibrate_outlines(&mut self, scans: &[(&[ScanPoint], Vec<ScanPoint>)]) {
+        self.outlines = Outline::of(&self.surfels);
+        for outline in &mut self.outlines {
+            outline.calibrate(scans);
+        }
+    }
+
+    /// Whether the first look found surface within a voxel and a half of a place.
+    pub(super) fn has_surface_at(&self, place: &Vector3<f64>) -> bool {
+        let near = |index: u32| {
+            let surfel = &self.surfels[index as usize];
+            !surfel.grown && (surfel.point - place).norm_squared() < (1.5 * VOXEL).powi(2)
+        };
+        self.field.nearest(place).into_iter().flatten().any(near)
+    }
+
+    /// A sphere about the centroid that holds the part, and a margin \[m\].
+    pub fn reach(&self) -> f64 {
+        self.surfels.iter().map(|s| (s.point - self.centroid).norm()).fold(0.0, f64::max) + 0.05
     }
 
     /// Normals of the large flat faces seen at the first look, up to sign.
