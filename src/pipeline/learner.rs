@@ -483,7 +483,7 @@ impl Learner {
 
     /// Log prior of a joint between two parts by the gap between their surfaces: what is joined
     /// touches. `None`: the nearest of the parts that never moved.
-    pub(super) fn log_contact_prior(&self, child: Label, parent: Option<Label>) -> f64 {
+    fn log_contact_prior(&self, child: Label, parent: Option<Label>) -> f64 {
         let gap = |other: Label| self.gaps.get(&(child.min(other), child.max(other))).copied().unwrap_or(0.0);
         let gap = match parent {
             Some(parent) => gap(parent),
