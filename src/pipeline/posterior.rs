@@ -131,18 +131,13 @@ struct Known<'a> {
 fn edges(root: Label, labels: &[Label], known: Option<Known<'_>>) -> Vec<EdgePosterior> {
     let nodes: Vec<Label> = [root].into_iter().chain(labels.iter().copied().filter(|l| *l != root)).collect();
     let evidence = |child: Label| known.and_then(|known| known.learner.evidence.get(&child));
-    // As the learner weighs them: what is far apart is unlikely to be joined.
-    let weight = |child: Label, option: &ParentEvidence| {
-        let prior = known.map_or(0.0, |known| known.learner.log_contact_prior(child, option.parent));
-        log_sum(&option.log_evidence) + prior
-    };
     let mut log_weights = DMatrix::zeros(nodes.len(), nodes.len());
     for (j, child) in nodes.iter().enumerate().skip(1) {
         let Some(options) = evidence(*child) else { continue };
         for (i, parent) in nodes.iter().enumerate() {
             let moved = evidence(*parent).is_some();
             log_weights[(i, j)] =
-                option_for(options, *parent, moved).map_or(f64::NEG_INFINITY, |option| weight(*child, option));
+                option_for(options, *parent, moved).map_or(f64::NEG_INFINITY, |o| log_sum(&o.log_evidence));
         }
     }
     let Ok(trees) = TreeDistribution::new(&log_weights) else { return Vec::new() };
