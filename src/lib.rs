@@ -20,6 +20,7 @@ pub mod inference;
 pub mod io;
 pub mod math;
 pub mod mechanism;
+pub mod criticism;
 pub mod model;
 pub mod pipeline;
 pub mod registration;

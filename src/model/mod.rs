@@ -5,7 +5,11 @@ mod edges;
 mod kinematics;
 mod window;
 
-pub use dynamics::{DynamicsInput, DynamicsLearner, DynamicsPosterior, JointDynamics, PartDynamics, WindowInference};
+pub use dynamics::{
+    AddedEffect, AddedTable, BatchFit, BatchWindow, BatchedWindow, DAMPING, DeclaredPhysics, DynamicsInput, DynamicsLearner,
+    DynamicsPosterior, FRICTION, Hypothesis, INERTIA, JointDynamics, JointModel, JointScales, Mechanism, PartDynamics,
+    SENSOR_SIZE, SIZE, SensorModel, WindowInference, WindowModel,
+};
 pub use edges::{EdgeFit, EdgePart, axes_from_motion, moving_evidence, relative_windows, rigid_evidence};
 pub use kinematics::{Axis, KinematicFit, KinematicJoint, KinematicSettings, fit_kinematics};
 pub use window::{Contact, PoseMeasurement, WindowObservations};

@@ -31,6 +31,8 @@ pub enum Dimension {
     Damping,
     /// N·s²/m² or N·m·s²/rad².
     Drag,
+    /// kg or kg·m².
+    Inertia,
     /// rad, of a periodic law.
     Phase,
     /// s.
@@ -84,6 +86,13 @@ impl Dimension {
                     "N·s²/m²"
                 }
             }
+            Self::Inertia => {
+                if turns {
+                    "kg·m²"
+                } else {
+                    "kg"
+                }
+            }
             Self::Phase => "rad",
             Self::Time => "s",
         }
@@ -98,6 +107,8 @@ impl Dimension {
             Self::Stiffness => scales.force / scales.position,
             Self::Damping => scales.force / scales.rate,
             Self::Drag => scales.force / (scales.rate * scales.rate),
+            // A rate is reached in about half a second.
+            Self::Inertia => 0.5 * scales.force / scales.rate,
             Self::Phase => 1.0,
             Self::Time => scales.duration_s,
         }

@@ -11,11 +11,11 @@
 use nalgebra::{DMatrix, DVector};
 use num_dual::DualSVec64;
 
-use super::layout::Mechanism;
+use super::layout::{Mechanism, SensorError};
 use super::track::JointTrack;
 use crate::inference::Failure;
 use crate::math::Real;
-use crate::mechanism::{State, Tree, WrenchSample, WrenchTrack, rollout};
+use crate::mechanism::{State, Tree, WrenchPoint, WrenchSample, WrenchTrack, rollout};
 use crate::model::Axis;
 
 /// Longest step of the simulation \[s\]: half a wrench sample; trajectories of the midpoint step
@@ -83,17 +83,23 @@ const CHUNK: usize = 6;
 /// 60 ms a window in copies, one more simulation .3 ms; away from switches the two agree to 1e-5.
 const DIFFERENCE: f64 = 1e-6;
 
-/// A tree with derivatives along some of the directions: first parameters, then q, then q̇.
+/// What a simulation needs of the parameters.
+pub(super) struct Plant<T: Real> {
+    tree: Tree<T>,
+    sensor: SensorError<T>,
+}
+
+/// A plant with derivatives along some of the directions: first parameters, then q, then q̇.
 struct Chunk {
-    tree: Tree<DualSVec64<CHUNK>>,
+    plant: Plant<DualSVec64<CHUNK>>,
     first: usize,
 }
 
 /// How the derivatives of a span are taken.
 enum Slopes {
     Forward(Vec<Chunk>),
-    /// The tree, and one for each parameter moved by [`DIFFERENCE`].
-    Differences(Tree<f64>, Vec<Tree<f64>>),
+    /// The plant, and one for each parameter moved by [`DIFFERENCE`].
+    Differences(Plant<f64>, Vec<Plant<f64>>),
 }
 
 impl WindowModel<'_> {
@@ -155,13 +161,13 @@ impl WindowModel<'_> {
     /// Whitened innovations at `x` with gains from elsewhere.
     pub fn residuals(&self, x: &[f64], gains: &[Gain]) -> Result<Vec<f64>, Failure> {
         let n = self.moving.len();
-        let tree = self.mechanism.tree(x, self.axes, self.frozen)?;
+        let plant = self.plant(x)?;
         let mut state = self.first_state();
         let mut all = Vec::with_capacity(n * gains.len());
         for (k, (observation, Gain { gain, deviation })) in self.track.observations.iter().zip(gains).enumerate() {
             if k > 0 {
                 let span = [self.track.observations[k - 1].time_s, observation.time_s];
-                let run = self.advance(&tree, state.as_slice(), span)?;
+                let run = self.advance(&plant, state.as_slice(), span)?;
                 state = DVector::from_vec(run);
             }
             let innovation = &observation.value - &observation.rows * state.rows(0, n);
@@ -170,6 +176,11 @@ impl WindowModel<'_> {
             state += gain * innovation;
         }
         if all.iter().all(|e: &f64| e.is_finite()) { Ok(all) } else { Err(Failure::Diverged) }
+    }
+
+    pub(super) fn plant<T: Real>(&self, x: &[T]) -> Result<Plant<T>, Failure> {
+        let tree = self.mechanism.tree(x, self.axes, self.frozen)?;
+        Ok(Plant { tree, sensor: self.mechanism.sensor_error(x) })
     }
 
     fn forward(&self, x: &[f64], active: &[usize]) -> Result<Slopes, Failure> {
@@ -181,7 +192,7 @@ impl WindowModel<'_> {
                     parameters[at] = parameters[at].derivative(i - first);
                 }
             }
-            Ok(Chunk { tree: self.mechanism.tree(&parameters, self.axes, self.frozen)?, first })
+            Ok(Chunk { plant: self.plant(&parameters)?, first })
         });
         Ok(Slopes::Forward(chunks.collect::<Result<_, Failure>>()?))
     }
@@ -190,10 +201,10 @@ impl WindowModel<'_> {
         let moved = active.iter().map(|&at| {
             let mut moved = x.to_vec();
             moved[at] += DIFFERENCE;
-            self.mechanism.tree(&moved, self.axes, self.frozen)
+            self.plant(&moved)
         });
         let moved = moved.collect::<Result<_, Failure>>()?;
-        Ok(Slopes::Differences(self.mechanism.tree(x, self.axes, self.frozen)?, moved))
+        Ok(Slopes::Differences(self.plant(x)?, moved))
     }
 
     /// The state after a span, and its derivatives by parameters and by the state before.
@@ -206,21 +217,21 @@ impl WindowModel<'_> {
     ) -> Result<(DVector<f64>, DMatrix<f64>), Failure> {
         let chunks = match slopes {
             Slopes::Forward(chunks) => chunks,
-            Slopes::Differences(tree, moved) => {
-                let after = DVector::from_vec(self.advance(tree, state.as_slice(), span)?);
+            Slopes::Differences(plant, moved) => {
+                let after = DVector::from_vec(self.advance(plant, state.as_slice(), span)?);
                 let mut derivatives = DMatrix::zeros(state.len(), p + state.len());
-                let mut slope = |column: usize, tree: &Tree<f64>, start: &DVector<f64>| -> Result<(), Failure> {
-                    let end = DVector::from_vec(self.advance(tree, start.as_slice(), span)?);
+                let mut slope = |column: usize, plant: &Plant<f64>, start: &DVector<f64>| -> Result<(), Failure> {
+                    let end = DVector::from_vec(self.advance(plant, start.as_slice(), span)?);
                     derivatives.set_column(column, &((end - &after) / DIFFERENCE));
                     Ok(())
                 };
-                for (column, tree) in moved.iter().enumerate() {
-                    slope(column, tree, state)?;
+                for (column, plant) in moved.iter().enumerate() {
+                    slope(column, plant, state)?;
                 }
                 for i in 0..state.len() {
                     let mut start = state.clone();
                     start[i] += DIFFERENCE;
-                    slope(p + i, tree, &start)?;
+                    slope(p + i, plant, &start)?;
                 }
                 return Ok((after, derivatives));
             }
@@ -238,7 +249,7 @@ impl WindowModel<'_> {
                     }
                 })
                 .collect();
-            for (i, value) in self.advance(&chunk.tree, &start, span)?.iter().enumerate() {
+            for (i, value) in self.advance(&chunk.plant, &start, span)?.iter().enumerate() {
                 after[i] = value.re;
                 if let Some(eps) = &value.eps.0 {
                     for direction in 0..CHUNK.min(p + size - chunk.first) {
@@ -251,7 +262,27 @@ impl WindowModel<'_> {
     }
 
     /// (q, q̇) of the moving joints after a span.
-    fn advance<T: Real>(&self, tree: &Tree<T>, state: &[T], span: [f64; 2]) -> Result<Vec<T>, Failure> {
+    pub(super) fn advance<T: Real>(&self, plant: &Plant<T>, state: &[T], span: [f64; 2]) -> Result<Vec<T>, Failure> {
+        // The sensor's errors act while the tool does, so a span in which contact begins or ends is cut.
+        let samples = &self.track.samples;
+        let delay_s = plant.sensor.delay_s.value();
+        let contact = (samples.len() > 4 && self.mechanism.sensor.bias)
+            .then(|| [samples[1].stamp_s - delay_s, samples[samples.len() - 2].stamp_s - delay_s]);
+        let cut = contact.into_iter().flatten().find(|t| *t > span[0] + 1e-6 && *t < span[1] - 1e-6);
+        if let Some(cut) = cut {
+            let middle = self.advance_evenly(plant, state, [span[0], cut], contact)?;
+            return self.advance_evenly(plant, &middle, [cut, span[1]], contact);
+        }
+        self.advance_evenly(plant, state, span, contact)
+    }
+
+    fn advance_evenly<T: Real>(
+        &self,
+        Plant { tree, sensor }: &Plant<T>,
+        state: &[T],
+        span: [f64; 2],
+        contact: Option<[f64; 2]>,
+    ) -> Result<Vec<T>, Failure> {
         let n = self.moving.len();
         let mut positions = vec![T::zero(); self.mechanism.joints.len()];
         let mut rates = positions.clone();
@@ -259,8 +290,21 @@ impl WindowModel<'_> {
             positions[joint] = state[i];
             rates[joint] = state[n + i];
         }
-        let samples = within(&self.track.samples, span);
-        let track = self.track.touched.map(|body| WrenchTrack::new(body, samples));
+        let middle_s = 0.5 * (span[0] + span[1]);
+        let touches = contact.is_none_or(|[from, to]| middle_s > from && middle_s < to);
+        let all = &self.track.samples;
+        // Where a bias counts, the zeros about the contact do not.
+        let all = if contact.is_some() { &all[1..all.len() - 1] } else { &all[..] };
+        let delay_s = sensor.delay_s.value();
+        let samples = within(all, [span[0] + delay_s, span[1] + delay_s]);
+        let track = self.track.touched.filter(|_| touches).map(|body| WrenchTrack {
+            body,
+            samples,
+            point: WrenchPoint::Recorded,
+            delay_s: sensor.delay_s,
+            force_bias: sensor.force_bias,
+            torque_bias: sensor.torque_bias,
+        });
         let step_s = if n > 1 { CHAIN_STEP_S } else { STEP_S };
         let run = rollout(tree, &State::new(positions, rates), track.as_slice(), &span, step_s)
             .map_err(|_| Failure::Diverged)?;

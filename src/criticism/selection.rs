@@ -1,0 +1,354 @@
+//! Which additions the windows call for: forward selection by evidence, each refitted.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::numbers::{Addition, Numbers, Workshop};
+use super::rest::RestReadings;
+use super::signature::{Ranked, probes, start_by_direction};
+use crate::inference::Failure;
+use crate::mechanism::effects::{EffectKind, TableKind};
+use crate::model::{BatchFit, BatchWindow, Hypothesis};
+
+/// An addition is accepted if it raises the log evidence by this, and by the logarithm of how many
+/// were tried: see docs/criticism.md for the false alarms that it leaves.
+const LEAST_GAIN: f64 = 6.0;
+/// The same for a table, which fits much.
+const LEAST_TABLE_GAIN: f64 = 10.0;
+/// How many of the ranked are refitted, and from how much first-order gain on \[nats\].
+const REFITTED: usize = 5;
+const WORTH_A_REFIT: f64 = 3.0;
+/// Additions at most.
+const MOST: usize = 4;
+/// Linearizations of a refit, and how often κ is chosen anew.
+const REFIT: (usize, usize) = (8, 2);
+
+/// The model selected, with all that was compared on the way.
+#[derive(Clone, Debug)]
+pub struct Selection {
+    /// What it has beyond the declared physics.
+    pub additions: BTreeSet<Addition>,
+    /// Its numbers.
+    pub numbers: Numbers,
+    /// By component of joints that move together: its joints, its windows, and the fit.
+    pub components: Vec<Component>,
+    /// Log evidence \[nats\].
+    pub log_evidence: f64,
+    /// For every addition accepted: the log evidence of the model without it, and of those with
+    /// another in its place.
+    pub rivals: BTreeMap<Addition, Vec<(Option<Addition>, f64)>>,
+    /// Linearizations of all windows spent.
+    pub steps: usize,
+}
+
+/// Joints whose windows hang together.
+#[derive(Clone, Debug)]
+pub struct Component {
+    /// Joints by index.
+    pub joints: Vec<usize>,
+    /// Places of its windows in the batch.
+    pub windows: Vec<usize>,
+    /// The fit of those.
+    pub fitted: Option<BatchFit>,
+}
+
+/// Joints that move in the same windows, or all that move if `together`.
+pub fn components(batch: &[BatchWindow], together: bool) -> Vec<Component> {
+    let mut components: Vec<Component> = Vec::new();
+    for (w, window) in batch.iter().enumerate() {
+        let joints: Vec<usize> = window.involved.iter().map(|(joint, _)| *joint).collect();
+        let mut merged = Component { joints, windows: vec![w], fitted: None };
+        components.retain(|component| {
+            let shares = together || component.joints.iter().any(|joint| merged.joints.contains(joint));
+            if shares {
+                merged.joints.extend(&component.joints);
+                merged.windows.extend(&component.windows);
+            }
+            !shares
+        });
+        merged.joints.sort_unstable();
+        merged.joints.dedup();
+        merged.windows.sort_unstable();
+        components.push(merged);
+    }
+    components.sort_by_key(|component| component.joints.clone());
+    components
+}
+
+/// What candidates are tried on.
+pub struct Selector<'a> {
+    /// What models are made from.
+    pub workshop: &'a Workshop<'a>,
+    /// The windows.
+    pub batch: &'a [BatchWindow],
+    /// What the sensor read at rest.
+    pub rest: Option<&'a RestReadings>,
+}
+
+/// A refitted candidate.
+struct Trial {
+    addition: Addition,
+    gain: f64,
+    hypothesis: Hypothesis,
+    fits: Vec<(Vec<usize>, BatchFit)>,
+}
+
+impl Selector<'_> {
+    fn windows(&self, places: &[usize]) -> Vec<&BatchWindow> {
+        places.iter().map(|&w| &self.batch[w]).collect()
+    }
+
+    /// The model with these additions and no others.
+    pub fn fitted(&self, additions: &BTreeSet<Addition>, numbers: &Numbers, effort: (usize, usize)) -> Result<Selection, Failure> {
+        let together = additions.iter().any(|a| a.joint().is_none());
+        let hypothesis = self.workshop.hypothesis(additions)?;
+        let mut selection = Selection {
+            additions: additions.clone(),
+            numbers: numbers.clone(),
+            components: components(self.batch, together),
+            log_evidence: self.sensor_evidence(additions),
+            rivals: BTreeMap::new(),
+            steps: 0,
+        };
+        for component in &mut selection.components {
+            let windows = self.windows(&component.windows);
+            let x = selection.numbers.laid_out(&hypothesis, additions);
+            let scales = vec![10.0; windows.len()];
+            let fitted = hypothesis.fit(&windows, &x, &scales, effort)?;
+            selection.numbers.take(&hypothesis, additions, &fitted.x, &component.joints);
+            selection.log_evidence += fitted.log_evidence;
+            selection.steps += fitted.steps;
+            component.fitted = Some(fitted);
+        }
+        Ok(selection)
+    }
+
+    /// What the readings at rest say of the additions.
+    fn sensor_evidence(&self, additions: &BTreeSet<Addition>) -> f64 {
+        let biased = additions.contains(&Addition::Bias);
+        self.rest.filter(|_| biased).map_or(0.0, RestReadings::evidence_of_bias)
+    }
+
+    /// Adds what the windows call for, until nothing gains enough.
+    pub fn select(&self, mut current: Selection) -> Result<Selection, Failure> {
+        let declared = self.workshop.learner.declared_mechanism();
+        let friction_declared = declared.joints.iter().all(|joint| joint.friction);
+        while current.additions.len() < MOST * declared.joints.len().max(1) {
+            let ranked = self.ranked(&current, friction_declared)?;
+            let candidates = ranked.len().max(1) as f64;
+            let mut trials: Vec<Trial> = Vec::new();
+            for candidate in self.shortlist(&ranked) {
+                if let Ok(trial) = self.trial(&current, &candidate) {
+                    current.steps += trial.fits.iter().map(|(_, f)| f.steps).sum::<usize>();
+                    tracing::debug!(addition = ?trial.addition, first_order = candidate.gain, gain = trial.gain, "trial");
+                    trials.push(trial);
+                }
+            }
+            let best = trials.iter().max_by(|a, b| a.gain.total_cmp(&b.gain));
+            let Some(best) = best.filter(|best| best.gain > LEAST_GAIN + candidates.ln()) else { break };
+            let mut rivals: Vec<(Option<Addition>, f64)> = trials
+                .iter()
+                .filter(|t| t.addition != best.addition && same_place(t.addition, best.addition))
+                .map(|t| (Some(t.addition), t.gain - best.gain))
+                .collect();
+            rivals.push((None, -best.gain));
+            let addition = best.addition;
+            self.take(&mut current, best);
+            current.rivals.insert(addition, rivals);
+            self.drop_what_is_not_needed(&mut current, addition)?;
+        }
+        Ok(current)
+    }
+
+    /// Everything that might be added, by joint.
+    fn ranked(&self, current: &Selection, friction_declared: bool) -> Result<Vec<Ranked>, Failure> {
+        let hypothesis = self.workshop.hypothesis(&current.additions)?;
+        let mut ranked: Vec<Ranked> = Vec::new();
+        let mut of_sensor: BTreeMap<Addition, Ranked> = BTreeMap::new();
+        for component in &current.components {
+            let Some(fitted) = &component.fitted else { continue };
+            let windows = self.windows(&component.windows);
+            let moved = component.joints.iter().filter(|joint| windows.iter().any(|w| w.moving.contains(joint)));
+            for (k, &joint) in moved.enumerate() {
+                let [own, sensor] = probes(self.workshop, &hypothesis, fitted, &windows, joint)?;
+                ranked.extend(own.rank(&current.additions, friction_declared));
+                if k > 0 {
+                    continue;
+                }
+                for candidate in sensor.rank(&current.additions, friction_declared) {
+                    let entry = of_sensor.entry(candidate.addition).or_insert_with(|| Ranked { gain: 0.0, ..candidate.clone() });
+                    entry.gain += candidate.gain;
+                }
+            }
+        }
+        ranked.extend(of_sensor.into_values());
+        Ok(ranked)
+    }
+
+    /// The best few of every joint, and the sensor's.
+    fn shortlist(&self, ranked: &[Ranked]) -> Vec<Ranked> {
+        let mut by_place: BTreeMap<Option<usize>, Vec<&Ranked>> = BTreeMap::new();
+        for candidate in ranked {
+            by_place.entry(candidate.addition.joint()).or_default().push(candidate);
+        }
+        let mut shortlist: Vec<Ranked> = Vec::new();
+        for mut candidates in by_place.into_values() {
+            candidates.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.addition.cmp(&b.addition)));
+            let rest = |c: &Ranked| c.addition == Addition::Bias && self.sensor_evidence(&BTreeSet::from([Addition::Bias])) > 0.0;
+            let worth = candidates.iter().filter(|c| c.gain > WORTH_A_REFIT || rest(c)).take(REFITTED);
+            shortlist.extend(worth.map(|c| (*c).clone()));
+        }
+        shortlist
+    }
+
+    /// The model with one addition more, refitted where it matters.
+    fn trial(&self, current: &Selection, candidate: &Ranked) -> Result<Trial, Failure> {
+        let addition = candidate.addition;
+        let mut additions = current.additions.clone();
+        additions.insert(addition);
+        let hypothesis = self.workshop.hypothesis(&additions)?;
+        let mut numbers = current.numbers.clone();
+        let mut start = candidate.start.clone();
+        if let Addition::Effect(joint, kind @ EffectKind::AsymmetricFriction) = addition
+            && let Some(effect) = hypothesis.mechanism.joints[joint].effects.last()
+        {
+            start = start_by_direction(&numbers.joints[joint], &start, kind, &effect.scales);
+        }
+        if let Addition::Friction(joint) = addition {
+            numbers.joints[joint][crate::model::FRICTION] = start[0];
+        }
+        numbers.added.insert(addition, start);
+        let x = numbers.laid_out(&hypothesis, &additions);
+        let concerned: Vec<&Component> = match addition.joint() {
+            Some(joint) => current.components.iter().filter(|c| c.joints.contains(&joint)).collect(),
+            None => current.components.iter().collect(),
+        };
+        let mut places: Vec<usize> = concerned.iter().flat_map(|c| c.windows.iter().copied()).collect();
+        places.sort_unstable();
+        let before: f64 = concerned.iter().filter_map(|c| c.fitted.as_ref()).map(|f| f.log_evidence).sum();
+        let scale = |w: &usize| {
+            concerned.iter().find_map(|c| {
+                let at = c.windows.iter().position(|own| own == w)?;
+                c.fitted.as_ref().map(|f| f.windows[at].noise_scale)
+            })
+        };
+        let scales: Vec<f64> = places.iter().map(|w| scale(w).unwrap_or(10.0)).collect();
+        let fitted = hypothesis.fit(&self.windows(&places), &x, &scales, REFIT)?;
+        let rest = self.sensor_evidence(&additions) - self.sensor_evidence(&current.additions);
+        let gain = fitted.log_evidence - before + rest;
+        Ok(Trial { addition, gain, hypothesis, fits: vec![(places, fitted)] })
+    }
+
+    fn take(&self, current: &mut Selection, trial: &Trial) {
+        current.additions.insert(trial.addition);
+        for (places, fitted) in &trial.fits {
+            let together = current.additions.iter().any(|a| a.joint().is_none());
+            if together {
+                current.components = components(self.batch, true);
+            }
+            for component in &mut current.components {
+                if component.windows == *places {
+                    current.numbers.take(&trial.hypothesis, &current.additions, &fitted.x, &component.joints);
+                    component.fitted = Some(fitted.clone());
+                }
+            }
+        }
+        current.log_evidence += trial.gain;
+        // Layouts have changed for the others: their fits are carried over by name.
+        if let Ok(hypothesis) = self.workshop.hypothesis(&current.additions) {
+            let x = current.numbers.laid_out(&hypothesis, &current.additions);
+            for component in &mut current.components {
+                let windows: Vec<&BatchWindow> = component.windows.iter().map(|&w| &self.batch[w]).collect();
+                let Some(fitted) = &mut component.fitted else { continue };
+                fitted.x.clone_from(&x);
+                for (own, window) in fitted.windows.iter_mut().zip(&windows) {
+                    own.active = hypothesis.active(window);
+                }
+                let mut active: Vec<usize> = fitted.windows.iter().flat_map(|w| w.active.iter().copied()).collect();
+                active.sort_unstable();
+                active.dedup();
+                fitted.active = active;
+            }
+        }
+    }
+
+    /// After a right effect is in, one that stood in for it may go.
+    fn drop_what_is_not_needed(&self, current: &mut Selection, newest: Addition) -> Result<(), Failure> {
+        let others: Vec<Addition> = current.additions.iter().copied().filter(|a| *a != newest).collect();
+        for addition in others.into_iter().filter(|a| a.joint().is_none() || newest.joint().is_none() || a.joint() == newest.joint()) {
+            let mut fewer = current.additions.clone();
+            fewer.remove(&addition);
+            let without = self.fitted(&fewer, &current.numbers, (6, 1))?;
+            current.steps += without.steps;
+            tracing::debug!(?addition, loss = current.log_evidence - without.log_evidence, "without");
+            if without.log_evidence > current.log_evidence - LEAST_GAIN {
+                let (mut rivals, steps) = (std::mem::take(&mut current.rivals), current.steps);
+                rivals.remove(&addition);
+                *current = Selection { rivals, steps, ..without };
+            }
+        }
+        Ok(())
+    }
+
+    /// The table that explains most of what is left on a joint, with its gain over the model.
+    pub fn leftover(&self, current: &Selection) -> Result<Vec<(Addition, f64)>, Failure> {
+        const KINDS: [(TableKind, f64, f64); 6] = [
+            (TableKind::ForceOverPosition, 0.3, 0.3),
+            (TableKind::ForceOverRate, 0.3, 1.0),
+            (TableKind::FrictionOverPosition, 0.3, 0.3),
+            (TableKind::FrictionOverTime, 0.3, 10.0),
+            (TableKind::InertiaOverPosition, 0.2, 0.3),
+            (TableKind::ForceOverTime, 0.3, 0.5),
+        ];
+        let hypothesis = self.workshop.hypothesis(&current.additions)?;
+        let mut found = Vec::new();
+        for component in &current.components {
+            let Some(fitted) = &component.fitted else { continue };
+            let windows = self.windows(&component.windows);
+            let moved = component.joints.iter().filter(|joint| windows.iter().any(|w| w.moving.contains(joint)));
+            for &joint in moved {
+                let [own, _] = probes(self.workshop, &hypothesis, fitted, &windows, joint)?;
+                let Some(scales) = self.workshop.learner.joint_scales(joint, self.workshop.fit) else { continue };
+                for (kind, deviation, correlation) in KINDS {
+                    let length = match kind {
+                        TableKind::ForceOverRate => correlation * scales.rate,
+                        TableKind::FrictionOverTime | TableKind::ForceOverTime => correlation,
+                        _ => correlation * scales.travel.abs(),
+                    };
+                    if let Some(gain) = own.table_gain(kind, deviation, length) {
+                        found.push((Addition::Table(joint, kind), gain));
+                    }
+                }
+            }
+        }
+        found.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+        Ok(found)
+    }
+
+    /// Adds the tables that what is left calls for; the named ones that then gain nothing go.
+    pub fn describe_leftover(&self, mut current: Selection) -> Result<Selection, Failure> {
+        let leftover = self.leftover(&current)?;
+        tracing::debug!(?leftover, "leftover");
+        let mut described: BTreeSet<usize> = BTreeSet::new();
+        for (addition, gain) in leftover {
+            let Some(joint) = addition.joint() else { continue };
+            if gain < LEAST_TABLE_GAIN || described.contains(&joint) {
+                continue;
+            }
+            let trial = self.trial(&current, &Ranked { addition, gain, start: Vec::new() });
+            let Ok(trial) = trial else { continue };
+            tracing::debug!(?addition, gain, refitted = trial.gain, "table");
+            if trial.gain > LEAST_TABLE_GAIN {
+                described.insert(joint);
+                self.take(&mut current, &trial);
+                current.rivals.insert(addition, vec![(None, -trial.gain)]);
+                self.drop_what_is_not_needed(&mut current, addition)?;
+            }
+        }
+        Ok(current)
+    }
+}
+
+/// Whether two additions compete to explain the same.
+fn same_place(a: Addition, b: Addition) -> bool {
+    a.joint() == b.joint() || a.joint().is_none() || b.joint().is_none()
+}

@@ -1,0 +1,150 @@
+//! The learner's windows and physics as hypotheses see them, and how one of them is taken over.
+
+use nalgebra::DMatrix;
+
+use super::batch::{BatchWindow, Hypothesis};
+use super::layout::{AddedEffect, JointScales, Mechanism, SENSOR_SIZE, SIZE};
+use super::learner::{
+    Block, DynamicsInput, DynamicsLearner, Warm, added_effect, extended, kinematics_of, standard_sensor, travel_of,
+};
+use super::track::joint_track;
+use crate::inference::{Failure, Gaussian};
+use crate::mechanism::effects::EffectKind;
+use crate::model::KinematicFit;
+use crate::types::Label;
+
+impl DynamicsLearner {
+    /// The windows in which joints move, in joint space; of those that move the same joints, the
+    /// last `most`.
+    pub fn batch(&self, fit: &KinematicFit, input: &DynamicsInput<'_>, most: usize) -> Vec<BatchWindow> {
+        let kinematics = kinematics_of(fit);
+        let mut batch: Vec<BatchWindow> = Vec::new();
+        for index in (0..input.windows.len().min(self.windows.len())).rev() {
+            let (moving, frozen) = self.moving(index, fit);
+            if moving.is_empty() || batch.iter().filter(|w| w.moving == moving).count() >= most {
+                continue;
+            }
+            let Some(track) = joint_track(&self.source(index, &moving, fit, input), &kinematics) else { continue };
+            if track.observations.len() < 3 {
+                continue;
+            }
+            let involved = self.involved(fit, &moving);
+            batch.push(BatchWindow { index, axes: kinematics.axes.clone(), frozen, moving, involved, track });
+        }
+        batch.reverse();
+        batch
+    }
+
+    /// The joints with what was declared of them and nothing else.
+    pub fn declared_mechanism(&self) -> Mechanism {
+        let mut mechanism = self.mechanism.clone();
+        mechanism.sensor.bias = false;
+        mechanism.sensor.delay = false;
+        for model in &mut mechanism.joints {
+            model.friction = self.declared.friction;
+            model.effects.truncate(self.declared.effects.len());
+            model.tables.clear();
+        }
+        mechanism
+    }
+
+    /// Typical force and rate of a joint, and the farthest that it went.
+    pub fn joint_scales(&self, joint: usize, fit: &KinematicFit) -> Option<JointScales> {
+        let scales = self.joints.get(&fit.joints.get(joint)?.child)?.scales?;
+        let all: Vec<f64> = fit.positions.iter().flat_map(|window| window[joint].iter().copied()).collect();
+        Some(JointScales { travel: travel_of(&all), ..scales })
+    }
+
+    /// An effect as it would be on a joint.
+    pub fn effect_on(&self, joint: usize, kind: EffectKind, fit: &KinematicFit) -> Option<AddedEffect> {
+        Some(added_effect(kind, &self.joint_scales(joint, fit)?))
+    }
+
+    /// A mechanism with the prior of its numbers; the sensor's by what it read at rest, if known.
+    pub fn hypothesis(&self, mechanism: Mechanism, sensor_prior: Option<&Gaussian>) -> Result<Hypothesis, Failure> {
+        let size = mechanism.size();
+        let mut prior = Gaussian::flat(size);
+        for (k, model) in mechanism.joints.iter().enumerate() {
+            let base = self.belief.prior(&Block::Dynamics(model.joint.child)).ok_or(Failure::NoInformation)?;
+            let offset = mechanism.offset(k);
+            let places: Vec<usize> = (offset..offset + model.size()).collect();
+            prior.multiply_at(&extended(&base.gaussian, model)?, &places);
+        }
+        let sensor = sensor_prior.cloned().map_or_else(standard_sensor, Ok)?;
+        prior.multiply_at(&sensor, &(size - SENSOR_SIZE..size).collect::<Vec<usize>>());
+        Ok(Hypothesis { mechanism, prior })
+    }
+
+    /// The first numbers of each joint as they are believed now, and the sensor's.
+    pub fn numbers(&self) -> Result<(Vec<Vec<f64>>, Vec<f64>), Failure> {
+        let (mean, _) = self.belief.product(None).moments(&self.blocks())?;
+        let joints = (0..self.mechanism.joints.len()).map(|k| {
+            let offset = self.mechanism.offset(k);
+            mean.rows(offset, SIZE).iter().copied().collect()
+        });
+        Ok((joints.collect(), mean.rows(mean.len() - SENSOR_SIZE, SENSOR_SIZE).iter().copied().collect()))
+    }
+
+    /// Takes a fitted hypothesis over: its effects are in the model from now on, and the sites of
+    /// the windows are made about `x`. κ by window.
+    pub fn adopt(
+        &mut self,
+        hypothesis: &Hypothesis,
+        x: &[f64],
+        noise_scales: &[(usize, f64)],
+        sensor_prior: Option<&Gaussian>,
+        (fit, input): (&KinematicFit, &DynamicsInput<'_>),
+    ) -> Result<(), Failure> {
+        self.sensor = hypothesis.mechanism.sensor;
+        self.sensor_prior = sensor_prior.cloned();
+        let labels: Vec<Label> = hypothesis.mechanism.joints.iter().map(|m| m.joint.child).collect();
+        for model in &hypothesis.mechanism.joints {
+            if let Some(memory) = self.joints.get_mut(&model.joint.child) {
+                memory.friction = model.friction;
+                memory.effects.clone_from(&model.effects);
+                memory.tables.clone_from(&model.tables);
+            }
+        }
+        for label in labels {
+            self.belief.drop_sites_of(&Block::Dynamics(label));
+        }
+        self.rebuild(fit)?;
+        for window in 0..self.windows.len() {
+            let (moving, frozen) = self.moving(window, fit);
+            if moving.is_empty() {
+                self.windows[window].learned = false;
+                continue;
+            }
+            let known = noise_scales.iter().find(|(index, _)| *index == window).map(|(_, scale)| *scale);
+            // The site of a batch's window is its linearization there; others start from it.
+            let steps = if known.is_some() { 1 } else { 4 };
+            let noise_scale = known.or(self.windows[window].noise_scale).unwrap_or(1.0);
+            let warm = Warm { x: x.to_vec(), noise_scale };
+            match self.fit_window(window, fit, input, &moving, &frozen, (steps, Some(&warm))) {
+                Ok((factor, fitted, _)) => {
+                    self.belief.replace(window, factor);
+                    let memory = &mut self.windows[window];
+                    memory.learned = true;
+                    memory.noise_scale = Some(fitted.noise_scale);
+                    memory.made_with(fit);
+                }
+                Err(_) => self.windows[window].learned = false,
+            }
+        }
+        Ok(())
+    }
+
+    /// Covariance of some numbers of the model as it is believed now, kinematic errors included.
+    pub fn moments_of(&self, places: &[usize]) -> Result<(Vec<f64>, DMatrix<f64>), Failure> {
+        let (mean, covariance) = self.belief.product(None).moments(&self.blocks())?;
+        Ok((
+            places.iter().map(|&i| mean[i]).collect(),
+            DMatrix::from_fn(places.len(), places.len(), |i, j| covariance[(places[i], places[j])]),
+        ))
+    }
+
+    /// The model as it is now.
+    pub fn mechanism(&self) -> &Mechanism {
+        &self.mechanism
+    }
+}
