@@ -15,12 +15,12 @@
 //! the wall: `math`, `types`, `geometry`, `registration`, `mechanism`, `structure`, `inference`,
 //! `model`, `tracking`, `pipeline`, `io`, `report`.
 
+pub mod criticism;
 pub mod geometry;
 pub mod inference;
 pub mod io;
 pub mod math;
 pub mod mechanism;
-pub mod criticism;
 pub mod model;
 pub mod pipeline;
 pub mod registration;

@@ -4,56 +4,142 @@
 //! product of the predictive densities of the windows, each by those before it, so that comparing
 //! evidence compares predictions of what was not learned yet.
 
+mod findings;
 mod numbers;
 mod rest;
+mod score;
 mod selection;
 mod signature;
 mod statistics;
 
 pub use numbers::{Addition, Numbers, Workshop};
-pub use selection::{Selection, Selector};
+pub use selection::{Component, Selection, Selector};
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crate::inference::Failure;
 use crate::model::{DynamicsInput, DynamicsLearner, KinematicFit};
+use crate::types::Label;
+use crate::types::posterior::{Criticism, Verdict};
 use rest::RestReadings;
+use score::scores;
 
 /// Windows of the same joints that are looked at together at most.
 const MOST_WINDOWS: usize = 8;
+/// Standard deviations of the sensor's errors by the prior: force \[N\], torque \[N·m\], delay \[s\].
+const SENSOR_SCALES: [f64; 3] = [1.0, 0.2, 0.05];
 
 /// Follows a learner and says what it lacks.
 #[derive(Clone, Debug, Default)]
 pub struct Critic {
     /// The last selection.
     pub selection: Option<Selection>,
+    findings: Option<Criticism>,
+    adopted: bool,
+    /// The joints that the last selection's numbers are about, and the numbers.
+    known: Option<(Vec<Label>, Numbers)>,
 }
 
 impl Critic {
-    /// Looks at all windows so far.
-    pub fn review(&mut self, learner: &DynamicsLearner, fit: &KinematicFit, input: &DynamicsInput<'_>) -> Result<(), Failure> {
+    /// What was found by the last review.
+    pub fn findings(&self) -> Criticism {
+        self.findings.clone().unwrap_or_else(Criticism::insufficient)
+    }
+
+    /// Looks at all windows so far; effects that they call for are in the learner's model after it.
+    /// Returns the linearizations spent.
+    ///
+    /// # Errors
+    /// Where no hypothesis could be fitted: the findings are then as before.
+    pub fn review(
+        &mut self,
+        learner: &mut DynamicsLearner,
+        fit: &KinematicFit,
+        input: &DynamicsInput<'_>,
+    ) -> Result<usize, Failure> {
         let batch = learner.batch(fit, input, MOST_WINDOWS);
         if batch.is_empty() {
-            return Ok(());
+            return Ok(0);
         }
-        let sensor_scales = [1.0, 0.2, 0.05];
-        let rest = RestReadings::of(&batch, input, &sensor_scales);
-        let spans = input
-            .windows
-            .iter()
-            .filter_map(|w| Some([*w.times_s.first()?, *w.times_s.last()?]))
-            .collect();
+        let rest = RestReadings::of(&batch, input, &SENSOR_SCALES);
+        let spans = input.windows.iter().filter_map(|w| Some([*w.times_s.first()?, *w.times_s.last()?])).collect();
         let rest_prior = rest.as_ref().and_then(RestReadings::posterior);
-        let workshop = Workshop { learner, fit, input, rest_prior, sensor_scales, spans };
-        let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref() };
+        let labels: Vec<Label> = fit.joints.iter().map(|joint| joint.child).collect();
         let (joints, sensor) = learner.numbers()?;
-        let numbers = Numbers { joints, sensor, added: Default::default() };
-        let base = selector.fitted(&BTreeSet::new(), &numbers, (10, 2))?;
-        tracing::debug!(evidence = base.log_evidence, scales = ?base.components.iter().map(|c| c.fitted.as_ref().map(|f| f.windows.iter().map(|w| (w.noise_scale, w.reduction)).collect::<Vec<_>>())).collect::<Vec<_>>(), "base");
-        let selected = selector.select(base)?;
-        let selected = selector.describe_leftover(selected)?;
-        tracing::debug!(evidence = selected.log_evidence, steps = selected.steps, additions = ?selected.additions, numbers = ?selected.numbers, "selected");
+        let known = self.known.as_ref().filter(|(of, _)| *of == labels);
+        let added = known.map_or_else(BTreeMap::new, |(_, numbers)| numbers.added.clone());
+        let numbers = Numbers { joints, sensor, added };
+        let (selected, findings) = {
+            let workshop =
+                Workshop { learner, fit, input, rest_prior: rest_prior.clone(), sensor_scales: SENSOR_SCALES, spans };
+            let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref() };
+            let base = selector.base(&numbers)?;
+            tracing::debug!(evidence = base.log_evidence, additions = ?base.additions, kappa = ?noise_scales(&base, &batch), "base");
+            let before = scores(&workshop, &batch, &base).unwrap_or_default();
+            let selected = selector.select(base.clone())?;
+            let mut selected = selector.describe_leftover(selected)?;
+            let mut after = before.clone();
+            if !selected.rivals.is_empty() {
+                match scores(&workshop, &batch, &selected) {
+                    // What does not predict windows not yet learned better is not there.
+                    Ok(found) if found.windows == 0 || found.log_predictive_density > before.log_predictive_density => {
+                        after = found;
+                    }
+                    _ => selected = Selection { steps: selected.steps, ..base },
+                }
+            }
+            tracing::debug!(evidence = selected.log_evidence, steps = selected.steps, additions = ?selected.additions,
+                kappa = ?noise_scales(&selected, &batch), before = before.log_predictive_density, after = after.log_predictive_density, "selected");
+            let named = selected.additions.iter().any(|a| !matches!(a, Addition::Stop(..)) && a.name() != "unknown");
+            let verdict = match () {
+                () if before.windows < 2 => Verdict::Insufficient,
+                () if named => Verdict::EffectFound,
+                () if !selected.rivals.is_empty() => Verdict::Unexplained,
+                () => Verdict::Adequate,
+            };
+            let findings = Criticism { verdict, effects: Vec::new(), before: before.rows, after: after.rows };
+            (selected, findings)
+        };
+        let found = findings.verdict != Verdict::Insufficient && !selected.rivals.is_empty();
+        let mut findings = findings;
+        if found || self.adopted {
+            let additions = if found { selected.additions.clone() } else { BTreeSet::new() };
+            let scales = noise_scales(&selected, &batch);
+            let spans = input.windows.iter().filter_map(|w| Some([*w.times_s.first()?, *w.times_s.last()?])).collect();
+            let hypothesis = Workshop {
+                learner,
+                fit,
+                input,
+                rest_prior: rest_prior.clone(),
+                sensor_scales: SENSOR_SCALES,
+                spans,
+            }
+            .hypothesis(&additions)?;
+            let x = selected.numbers.laid_out(&hypothesis, &additions);
+            let prior = rest_prior.as_ref().filter(|_| additions.contains(&Addition::Bias));
+            learner.adopt(&hypothesis, &x, &scales, prior, (fit, input))?;
+            self.adopted = found;
+            if found {
+                findings.effects = findings::effects(learner, &hypothesis, &selected, fit);
+            }
+        }
+        let steps = selected.steps;
+        self.known = Some((labels, selected.numbers.clone()));
+        self.findings = Some(findings);
         self.selection = Some(selected);
-        Ok(())
+        Ok(steps)
     }
+}
+
+/// κ by window.
+fn noise_scales(selection: &Selection, batch: &[crate::model::BatchWindow]) -> Vec<(usize, f64)> {
+    let mut scales: Vec<(usize, f64)> = Vec::new();
+    for component in &selection.components {
+        if let Some(fitted) = &component.fitted {
+            let own = component.windows.iter().zip(&fitted.windows);
+            scales.extend(own.map(|(&w, window)| (batch[w].index, window.noise_scale)));
+        }
+    }
+    scales.sort_by_key(|(index, _)| *index);
+    scales
 }

@@ -5,12 +5,15 @@ use std::collections::{BTreeMap, BTreeSet};
 use crate::inference::{Failure, Gaussian};
 use crate::mechanism::effects::{EffectKind, TableKind};
 use crate::model::{
-    AddedTable, DynamicsInput, DynamicsLearner, Hypothesis, JointScales, KinematicFit, SENSOR_SIZE, SIZE,
+    AddedTable, DynamicsInput, DynamicsLearner, FRICTION, Hypothesis, JointScales, KinematicFit, LIMIT_DEVIATION, LOWER,
+    SENSOR_SIZE, SIZE, UPPER,
 };
 
 /// One effect beyond the declared model; joints by index in the fit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Addition {
+    /// An end stop, lower or upper: part of the declared physics, once it is reached.
+    Stop(usize, bool),
     /// Coulomb friction, where it was not declared.
     Friction(usize),
     /// A named effect.
@@ -27,7 +30,7 @@ impl Addition {
     /// The joint that it acts on; none for the sensor's.
     pub fn joint(self) -> Option<usize> {
         match self {
-            Self::Friction(joint) | Self::Effect(joint, _) | Self::Table(joint, _) => Some(joint),
+            Self::Stop(joint, _) | Self::Friction(joint) | Self::Effect(joint, _) | Self::Table(joint, _) => Some(joint),
             Self::Bias | Self::Delay => None,
         }
     }
@@ -35,6 +38,7 @@ impl Addition {
     /// The name used in files.
     pub fn name(self) -> &'static str {
         match self {
+            Self::Stop(..) => "stop",
             Self::Friction(_) => "friction",
             Self::Effect(_, kind) => kind.name(),
             Self::Table(_, TableKind::FrictionOverPosition) => "position_friction",
@@ -79,6 +83,7 @@ impl Workshop<'_> {
         mechanism.sensor.scales = self.sensor_scales;
         for addition in additions {
             match *addition {
+                Addition::Stop(joint, upper) => mechanism.joints[joint].stops[usize::from(upper)] = true,
                 Addition::Friction(joint) => mechanism.joints[joint].friction = true,
                 Addition::Effect(joint, kind) => {
                     let mut effect = self.learner.effect_on(joint, kind, self.fit).ok_or(Failure::NoInformation)?;
@@ -94,7 +99,18 @@ impl Workshop<'_> {
             }
         }
         let biased = additions.contains(&Addition::Bias);
-        self.learner.hypothesis(mechanism, self.rest_prior.as_ref().filter(|_| biased))
+        let mut hypothesis = self.learner.hypothesis(mechanism, self.rest_prior.as_ref().filter(|_| biased))?;
+        for addition in additions {
+            if let Addition::Stop(joint, upper) = *addition {
+                let (low, high) = self.range(joint);
+                let end = if upper { high } else { low };
+                for place in places(&hypothesis, *addition) {
+                    hypothesis.prior.precision[(place, place)] = LIMIT_DEVIATION.powi(-2);
+                    hypothesis.prior.information[place] = end * LIMIT_DEVIATION.powi(-2);
+                }
+            }
+        }
+        Ok(hypothesis)
     }
 
     /// From time zero to the end of the last window \[s\].
@@ -142,7 +158,8 @@ pub fn places(hypothesis: &Hypothesis, addition: Addition) -> Vec<usize> {
     let mechanism = &hypothesis.mechanism;
     let sensor = mechanism.size() - SENSOR_SIZE;
     match addition {
-        Addition::Friction(joint) => vec![mechanism.offset(joint) + crate::model::FRICTION],
+        Addition::Friction(joint) => vec![mechanism.offset(joint) + FRICTION],
+        Addition::Stop(joint, upper) => vec![mechanism.offset(joint) + if upper { UPPER } else { LOWER }],
         Addition::Effect(joint, kind) => {
             let model = &mechanism.joints[joint];
             // Declared effects come first: the last of a kind is the added one.
@@ -171,7 +188,9 @@ impl Numbers {
         }
         for (joint, own) in self.joints.iter().enumerate() {
             let offset = mechanism.offset(joint);
-            x[offset..offset + SIZE].copy_from_slice(own);
+            if own.len() == SIZE {
+                x[offset..offset + SIZE].copy_from_slice(own);
+            }
         }
         for addition in additions {
             let known = self.added.get(addition);
@@ -186,9 +205,13 @@ impl Numbers {
 
     /// Takes over the numbers of some joints, of the additions to them, and of the sensor's.
     pub fn take(&mut self, hypothesis: &Hypothesis, additions: &BTreeSet<Addition>, x: &[f64], joints: &[usize]) {
-        for &joint in joints {
+        self.joints.resize_with(hypothesis.mechanism.joints.len(), Vec::new);
+        for joint in 0..self.joints.len() {
+            if !joints.contains(&joint) && self.joints[joint].len() == SIZE {
+                continue;
+            }
             let offset = hypothesis.mechanism.offset(joint);
-            self.joints[joint].copy_from_slice(&x[offset..offset + SIZE]);
+            self.joints[joint] = x[offset..offset + SIZE].to_vec();
         }
         for addition in additions.iter().filter(|a| a.joint().is_none_or(|joint| joints.contains(&joint))) {
             let values = places(hypothesis, *addition).into_iter().map(|place| x[place]).collect();

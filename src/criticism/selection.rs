@@ -19,6 +19,10 @@ const REFITTED: usize = 5;
 const WORTH_A_REFIT: f64 = 3.0;
 /// Additions at most.
 const MOST: usize = 4;
+/// A stop is believed from this gain on.
+const STOP_GAIN: f64 = 4.0;
+/// A delay is tried from these \[scales\]: the motion's dependence on it is far from linear.
+const DELAYS: [f64; 4] = [-0.8, 0.3, 1.0, 2.0];
 /// Linearizations of a refit, and how often κ is chosen anew.
 const REFIT: (usize, usize) = (8, 2);
 
@@ -128,23 +132,76 @@ impl Selector<'_> {
         self.rest.filter(|_| biased).map_or(0.0, RestReadings::evidence_of_bias)
     }
 
+    /// The declared physics with the end stops that the windows show.
+    pub fn base(&self, numbers: &Numbers) -> Result<Selection, Failure> {
+        let declared = self.workshop.learner.declared_mechanism();
+        let mut best: Option<Selection> = None;
+        let mut bland = numbers.clone();
+        bland.joints.clear();
+        // The learner's numbers may be what a wrong model made of the windows.
+        for start in [numbers, &bland] {
+            let misfit = best.as_ref().is_none_or(|b| {
+                let fits = b.components.iter().filter_map(|c| c.fitted.as_ref());
+                fits.flat_map(|f| &f.windows).any(|w| w.reduction > 3.0 || w.noise_scale > 50.0)
+            });
+            if !misfit {
+                continue;
+            }
+            if let Ok(fitted) = self.fitted(&BTreeSet::new(), start, (10, 2))
+                && best.as_ref().is_none_or(|b| fitted.log_evidence > b.log_evidence)
+            {
+                best = Some(fitted);
+            }
+        }
+        let mut current = best.ok_or(Failure::Diverged)?;
+        for component in current.components.clone() {
+            for &joint in &component.joints {
+                let moved = component.windows.iter().any(|&w| self.batch[w].moving.contains(&joint));
+                for upper in [false, true].into_iter().filter(|_| moved) {
+                    let stop = Addition::Stop(joint, upper);
+                    if declared.joints[joint].stops[usize::from(upper)] {
+                        continue;
+                    }
+                    let (low, high) = self.workshop.range(joint);
+                    let start = vec![if upper { high } else { low }];
+                    if let Ok(trial) = self.trial(&current, &Ranked { addition: stop, gain: 0.0, start }, (5, 1)) {
+                        current.steps += trial.fits.iter().map(|(_, f)| f.steps).sum::<usize>();
+                        if trial.gain > STOP_GAIN {
+                            self.take(&mut current, &trial);
+                        }
+                    }
+                }
+            }
+        }
+        Ok(current)
+    }
+
     /// Adds what the windows call for, until nothing gains enough.
     pub fn select(&self, mut current: Selection) -> Result<Selection, Failure> {
         let declared = self.workshop.learner.declared_mechanism();
         let friction_declared = declared.joints.iter().all(|joint| joint.friction);
-        while current.additions.len() < MOST * declared.joints.len().max(1) {
+        while current.rivals.len() < MOST * declared.joints.len().max(1) {
             let ranked = self.ranked(&current, friction_declared)?;
             let candidates = ranked.len().max(1) as f64;
             let mut trials: Vec<Trial> = Vec::new();
             for candidate in self.shortlist(&ranked) {
-                if let Ok(trial) = self.trial(&current, &candidate) {
+                if let Ok(trial) = self.best_trial(&current, &candidate) {
                     current.steps += trial.fits.iter().map(|(_, f)| f.steps).sum::<usize>();
                     tracing::debug!(addition = ?trial.addition, first_order = candidate.gain, gain = trial.gain, "trial");
                     trials.push(trial);
                 }
             }
-            let best = trials.iter().max_by(|a, b| a.gain.total_cmp(&b.gain));
-            let Some(best) = best.filter(|best| best.gain > LEAST_GAIN + candidates.ln()) else { break };
+            trials.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.addition.cmp(&b.addition)));
+            let least = LEAST_GAIN + candidates.ln();
+            let Some(best) = trials.first() else { break };
+            if best.gain < least {
+                // A right effect can gain nothing until its partner is in.
+                match self.pair(&current, best, friction_declared, least)? {
+                    Some(pair) => current = pair,
+                    None => break,
+                }
+                continue;
+            }
             let mut rivals: Vec<(Option<Addition>, f64)> = trials
                 .iter()
                 .filter(|t| t.addition != best.addition && same_place(t.addition, best.addition))
@@ -157,6 +214,49 @@ impl Selector<'_> {
             self.drop_what_is_not_needed(&mut current, addition)?;
         }
         Ok(current)
+    }
+
+    /// The model with the best candidate and the best partner of it, if the two gain enough.
+    fn pair(&self, current: &Selection, first: &Trial, friction_declared: bool, least: f64) -> Result<Option<Selection>, Failure> {
+        if first.gain < 0.0 {
+            return Ok(None);
+        }
+        let mut with_first = current.clone();
+        self.take(&mut with_first, first);
+        let ranked = self.ranked(&with_first, friction_declared)?;
+        let candidates = ranked.len().max(1) as f64;
+        for candidate in self.shortlist(&ranked).into_iter().take(2) {
+            let Ok(second) = self.best_trial(&with_first, &candidate) else { continue };
+            if first.gain + second.gain > least + candidates.ln() {
+                self.take(&mut with_first, &second);
+                with_first.rivals.insert(first.addition, vec![(None, -first.gain - second.gain)]);
+                with_first.rivals.insert(second.addition, vec![(None, -second.gain)]);
+                return Ok(Some(with_first));
+            }
+        }
+        Ok(None)
+    }
+
+    /// The best of a candidate's starts, refitted.
+    fn best_trial(&self, current: &Selection, candidate: &Ranked) -> Result<Trial, Failure> {
+        if candidate.addition != Addition::Delay {
+            return self.trial(current, candidate, REFIT);
+        }
+        let mut bland = current.clone();
+        bland.numbers.joints.clear();
+        let mut best: Option<(f64, Ranked, &Selection)> = None;
+        for from in [current, &bland] {
+            for delay in DELAYS {
+                let start = Ranked { start: vec![delay], ..candidate.clone() };
+                if let Ok(trial) = self.trial(from, &start, (4, 0))
+                    && best.as_ref().is_none_or(|(gain, _, _)| trial.gain > *gain)
+                {
+                    best = Some((trial.gain, start, from));
+                }
+            }
+        }
+        let (_, start, from) = best.ok_or(Failure::Diverged)?;
+        self.trial(from, &start, REFIT)
     }
 
     /// Everything that might be added, by joint.
@@ -201,7 +301,7 @@ impl Selector<'_> {
     }
 
     /// The model with one addition more, refitted where it matters.
-    fn trial(&self, current: &Selection, candidate: &Ranked) -> Result<Trial, Failure> {
+    fn trial(&self, current: &Selection, candidate: &Ranked, effort: (usize, usize)) -> Result<Trial, Failure> {
         let addition = candidate.addition;
         let mut additions = current.additions.clone();
         additions.insert(addition);
@@ -210,11 +310,9 @@ impl Selector<'_> {
         let mut start = candidate.start.clone();
         if let Addition::Effect(joint, kind @ EffectKind::AsymmetricFriction) = addition
             && let Some(effect) = hypothesis.mechanism.joints[joint].effects.last()
+            && !numbers.joints.is_empty()
         {
             start = start_by_direction(&numbers.joints[joint], &start, kind, &effect.scales);
-        }
-        if let Addition::Friction(joint) = addition {
-            numbers.joints[joint][crate::model::FRICTION] = start[0];
         }
         numbers.added.insert(addition, start);
         let x = numbers.laid_out(&hypothesis, &additions);
@@ -232,7 +330,7 @@ impl Selector<'_> {
             })
         };
         let scales: Vec<f64> = places.iter().map(|w| scale(w).unwrap_or(10.0)).collect();
-        let fitted = hypothesis.fit(&self.windows(&places), &x, &scales, REFIT)?;
+        let fitted = hypothesis.fit(&self.windows(&places), &x, &scales, effort)?;
         let rest = self.sensor_evidence(&additions) - self.sensor_evidence(&current.additions);
         let gain = fitted.log_evidence - before + rest;
         Ok(Trial { addition, gain, hypothesis, fits: vec![(places, fitted)] })
@@ -273,7 +371,8 @@ impl Selector<'_> {
 
     /// After a right effect is in, one that stood in for it may go.
     fn drop_what_is_not_needed(&self, current: &mut Selection, newest: Addition) -> Result<(), Failure> {
-        let others: Vec<Addition> = current.additions.iter().copied().filter(|a| *a != newest).collect();
+        let is_stop = |a: &Addition| matches!(a, Addition::Stop(..));
+        let others: Vec<Addition> = current.additions.iter().copied().filter(|a| *a != newest && !is_stop(a)).collect();
         for addition in others.into_iter().filter(|a| a.joint().is_none() || newest.joint().is_none() || a.joint() == newest.joint()) {
             let mut fewer = current.additions.clone();
             fewer.remove(&addition);
@@ -334,7 +433,7 @@ impl Selector<'_> {
             if gain < LEAST_TABLE_GAIN || described.contains(&joint) {
                 continue;
             }
-            let trial = self.trial(&current, &Ranked { addition, gain, start: Vec::new() });
+            let trial = self.trial(&current, &Ranked { addition, gain, start: Vec::new() }, REFIT);
             let Ok(trial) = trial else { continue };
             tracing::debug!(?addition, gain, refitted = trial.gain, "table");
             if trial.gain > LEAST_TABLE_GAIN {

@@ -11,7 +11,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 use thiserror::Error;
 
 use crate::{
-    model::KinematicSettings,
+    model::{DeclaredPhysics, KinematicSettings},
     pipeline::{PipelineSettings, WindowSettings},
     types::Label,
 };
@@ -57,6 +57,8 @@ pub struct Config {
     pub observations: ObservationConfig,
     /// What is assumed of pose measurements.
     pub kinematics: KinematicSettings,
+    /// Which physics is in the model from the start.
+    pub model: DeclaredPhysics,
 }
 
 impl Default for Config {
@@ -69,6 +71,7 @@ impl Default for Config {
             windows: WindowSettings::default(),
             observations: ObservationConfig::default(),
             kinematics: KinematicSettings::default(),
+            model: DeclaredPhysics::default(),
         }
     }
 }
@@ -82,6 +85,7 @@ impl Config {
             windows: self.windows,
             kinematics: self.kinematics,
             gravity_in_world: self.gravity_m_s2.into(),
+            declared: self.model.clone(),
             predict: false,
             posterior_latency_s: self.posterior_latency_s,
         }

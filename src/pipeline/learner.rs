@@ -6,6 +6,7 @@ use nalgebra::{DMatrix, Vector3};
 use rayon::prelude::*;
 
 use super::explain::{Baseline, Frame, Motion, Scene, explain_window, measure_faces, travel};
+use crate::criticism::Critic;
 use crate::geometry::{HullProperties, hull_properties};
 use crate::math::Pose;
 use crate::mechanism::JointType;
@@ -93,6 +94,8 @@ pub struct Learner {
     pub settings: KinematicSettings,
     /// Friction, damping, inertia and end stops.
     pub dynamics: DynamicsLearner,
+    /// What the dynamics lack.
+    pub critic: Critic,
     /// What learning each window's dynamics gave.
     pub inferences: Vec<WindowInference>,
     /// Hulls of the parts, as first seen.
@@ -122,6 +125,7 @@ impl Learner {
             fit: None,
             settings: KinematicSettings::default(),
             dynamics: DynamicsLearner::new(Vector3::new(0.0, 0.0, -9.81)),
+            critic: Critic::default(),
             inferences: Vec::new(),
             hulls: BTreeMap::new(),
         }
@@ -217,7 +221,12 @@ impl Learner {
             parts: &self.hulls,
             use_tool: self.use_tool,
         };
-        self.inferences.push(self.dynamics.learn_window(fit, &input));
+        let mut inference = self.dynamics.learn_window(fit, &input);
+        match self.critic.review(&mut self.dynamics, fit, &input) {
+            Ok(steps) => inference.steps += steps,
+            Err(failure) => tracing::debug!(%failure, "no review"),
+        }
+        self.inferences.push(inference);
     }
 
     /// Measures a part's poses in the last window, about its track.

@@ -16,7 +16,7 @@ pub use learner::{Learner, ParentEvidence, WindowJob};
 pub use windows::{FrameAssembler, WindowCutter, WindowSettings};
 
 use crate::math::Pose;
-use crate::model::{DynamicsLearner, KinematicSettings, PoseMeasurement};
+use crate::model::{DeclaredPhysics, DynamicsLearner, KinematicSettings, PoseMeasurement};
 use crate::registration::{AlignmentSettings, Quadratic, SurfelAccumulator, align, truncated_cost};
 use crate::types::{Input, Label, Stamp};
 use explain::{FEWEST_POINTS, measurement_of, travel};
@@ -42,6 +42,8 @@ pub struct PipelineSettings {
     pub kinematics: KinematicSettings,
     /// Gravity in world \[m/s²\].
     pub gravity_in_world: Vector3<f64>,
+    /// What is in the model of every joint from the start.
+    pub declared: DeclaredPhysics,
     /// Whether to predict.
     pub predict: bool,
     /// For prediction, a posterior counts from its window's close plus this \[s\].
@@ -215,7 +217,7 @@ impl Pipeline {
         });
         let mut learner = Learner::new(root, self.settings.use_tool, accumulators);
         learner.settings = self.settings.kinematics;
-        learner.dynamics = DynamicsLearner::new(self.gravity_in_work());
+        learner.dynamics = DynamicsLearner::new(self.gravity_in_work()).declaring(self.settings.declared.clone());
         learner.calibrate(&self.reference);
         self.reference.clear();
         self.learner = Some(learner);

@@ -46,7 +46,7 @@ impl Pipeline {
             parts,
             edges: edges(root, &labels, known),
             windows: self.learner.as_ref().map(window_records).unwrap_or_default(),
-            criticism: Criticism::insufficient(),
+            criticism: self.learner.as_ref().map_or_else(Criticism::insufficient, |learner| learner.critic.findings()),
         })
     }
 

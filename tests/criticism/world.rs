@@ -291,6 +291,7 @@ impl Record {
         };
         let legs = (handling.way.len() - 1) as f64;
         let mut force_before = Vector3::zeros();
+        let mut history: Vec<Vector3<f64>> = Vec::new();
         let mut quiet = 0;
         let mut poses = Vec::new();
         let mut rested: Option<(f64, f64)> = None;
@@ -334,12 +335,18 @@ impl Record {
                 }
             }
             let noise = |scale: f64, rng: &mut ChaCha8Rng| Vector3::from_fn(|_, _| scale * normal(rng));
+            // What is reported now acted a while ago; the tool is where it is.
+            history.push(force);
+            let late = delay_s / READING_S;
+            let (whole, part) = (late.floor() as usize, late.fract());
+            let at_lag = |lag: usize| i.checked_sub(lag).map_or_else(Vector3::zeros, |k| history[k]);
+            let reported = at_lag(whole) * (1.0 - part) + at_lag(whole + 1) * part;
             window.wrenches.push(AppliedWrench {
-                stamp: Stamp(((stamp_s + delay_s) * 1e9) as i64),
+                stamp: Stamp((stamp_s * 1e9) as i64),
                 source: 0,
                 part: None,
                 point_in_world: at + noise(TOOL_NOISE, rng),
-                force_in_world: force + bias + noise(FORCE_NOISE, rng),
+                force_in_world: reported + bias + noise(FORCE_NOISE, rng),
                 torque_in_world: Vector3::zeros(),
             });
             let mut parameters = object.parameters();

@@ -57,6 +57,16 @@ pub struct Gain {
     deviation: DMatrix<f64>,
 }
 
+/// One observation of the filter: before it and after it.
+pub(super) struct FilterStep {
+    pub(super) predicted: DVector<f64>,
+    pub(super) predicted_covariance: DMatrix<f64>,
+    pub(super) updated: DVector<f64>,
+    pub(super) updated_covariance: DMatrix<f64>,
+    /// Of the state from the observation before.
+    pub(super) transition: DMatrix<f64>,
+}
+
 /// Innovations of a window.
 #[derive(Clone, Debug, Default)]
 pub struct Innovations {
@@ -85,7 +95,7 @@ const DIFFERENCE: f64 = 1e-6;
 
 /// What a simulation needs of the parameters.
 pub(super) struct Plant<T: Real> {
-    tree: Tree<T>,
+    pub(super) tree: Tree<T>,
     sensor: SensorError<T>,
 }
 
@@ -115,11 +125,7 @@ impl WindowModel<'_> {
         }
         let mut state = self.first_state();
         let mut slopes = DMatrix::zeros(2 * n, p);
-        let mut covariance = DMatrix::from_fn(2 * n, 2 * n, |i, j| match (i == j, i < n) {
-            (false, _) => 0.0,
-            (true, true) => FIRST_POSITION.powi(2),
-            (true, false) => FIRST_RATE.powi(2),
-        });
+        let mut covariance = self.first_covariance();
         let mut result = Innovations::default();
         for (k, observation) in observations.iter().enumerate() {
             if k > 0 {
@@ -129,7 +135,7 @@ impl WindowModel<'_> {
                 let transition = derivatives.columns(p, 2 * n);
                 slopes = transition * slopes + derivatives.columns(0, p);
                 covariance = transition * covariance * transition.transpose();
-                covariance += noise.over(span, &self.all_positions(&state), self)?;
+                covariance += noise.over(span, &self.all_positions(state.as_slice()), self)?;
             }
             let innovation = &observation.value - &observation.rows * state.rows(0, n);
             let innovation_slopes = -(&observation.rows * slopes.rows(0, n));
@@ -156,6 +162,52 @@ impl WindowModel<'_> {
         } else {
             Err(Failure::Diverged)
         }
+    }
+
+    /// The filter alone, step by step.
+    pub(super) fn filtered(&self, x: &[f64]) -> Result<Vec<FilterStep>, Failure> {
+        let n = self.moving.len();
+        let slopes = if n > 1 { self.differences(x, &[])? } else { self.forward(x, &[])? };
+        let noise = ProcessNoise::new(self, x)?;
+        let mut predicted = self.first_state();
+        let mut covariance = self.first_covariance();
+        let mut transition = DMatrix::identity(2 * n, 2 * n);
+        let mut steps: Vec<FilterStep> = Vec::new();
+        let mut before_s = None;
+        for observation in &self.track.observations {
+            if let (Some(from_s), Some(last)) = (before_s, steps.last()) {
+                let span = [from_s, observation.time_s];
+                let (next, derivatives) = self.advance_with_slopes(&slopes, &last.updated, span, 0)?;
+                predicted = next;
+                transition = derivatives.columns(0, 2 * n).into_owned();
+                covariance = &transition * &last.updated_covariance * transition.transpose();
+                covariance += noise.over(span, &self.all_positions(predicted.as_slice()), self)?;
+            }
+            let innovation = &observation.value - &observation.rows * predicted.rows(0, n);
+            let spread = covariance.columns(0, n) * observation.rows.transpose();
+            let total = &observation.rows * spread.rows(0, n) + DMatrix::identity(n, n);
+            let gain = total.cholesky().ok_or(Failure::Diverged)?.solve(&spread.transpose()).transpose();
+            let updated_covariance = &covariance - &gain * spread.transpose();
+            steps.push(FilterStep {
+                updated: &predicted + &gain * innovation,
+                updated_covariance: (&updated_covariance + updated_covariance.transpose()) * 0.5,
+                predicted: predicted.clone(),
+                // Never singular, where a joint sticks.
+                predicted_covariance: &covariance + DMatrix::identity(2 * n, 2 * n) * 1e-14,
+                transition: transition.clone(),
+            });
+            before_s = Some(observation.time_s);
+        }
+        if steps.len() < 3 { Err(Failure::NoInformation) } else { Ok(steps) }
+    }
+
+    fn first_covariance(&self) -> DMatrix<f64> {
+        let n = self.moving.len();
+        DMatrix::from_fn(2 * n, 2 * n, |i, j| match (i == j, i < n) {
+            (false, _) => 0.0,
+            (true, true) => FIRST_POSITION.powi(2),
+            (true, false) => FIRST_RATE.powi(2),
+        })
     }
 
     /// Whitened innovations at `x` with gains from elsewhere.
@@ -312,7 +364,8 @@ impl WindowModel<'_> {
         Ok(self.moving.iter().map(|&j| positions[j]).chain(self.moving.iter().map(|&j| rates[j])).collect())
     }
 
-    fn all_positions(&self, state: &DVector<f64>) -> Vec<f64> {
+    /// Positions of all joints, those of the moving ones from a state; the others' are in the tree.
+    pub(super) fn all_positions(&self, state: &[f64]) -> Vec<f64> {
         let mut positions = vec![0.0; self.mechanism.joints.len()];
         for (i, &joint) in self.moving.iter().enumerate() {
             positions[joint] = state[i];

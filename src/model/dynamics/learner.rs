@@ -68,9 +68,9 @@ pub(super) struct JointMemory {
     /// A fit that finds the axis the other way round counts positions the other way.
     direction: Vector3<f64>,
     pub(super) scales: Option<JointScales>,
-    stops: [bool; 2],
+    pub(super) stops: [bool; 2],
     /// Where the stops are expected, once they are believed.
-    stop_positions: [f64; 2],
+    pub(super) stop_positions: [f64; 2],
     center_basis: Option<[Vector3<f64>; 2]>,
     hull: Option<HullProperties>,
     pub(super) friction: bool,

@@ -10,6 +10,7 @@ mod layout;
 mod learner;
 mod physics;
 mod posterior;
+mod residual;
 mod site;
 #[cfg(test)]
 mod tests;
@@ -18,7 +19,8 @@ mod track;
 pub use batch::{BatchFit, BatchWindow, BatchedWindow, Hypothesis};
 pub use innovations::WindowModel;
 pub use layout::{
-    AddedEffect, AddedTable, DAMPING, FRICTION, INERTIA, JointModel, JointScales, Mechanism, SENSOR_SIZE, SIZE, SensorModel,
+    AddedEffect, AddedTable, DAMPING, FRICTION, INERTIA, LIMIT_DEVIATION, LOWER, JointModel, JointScales, Mechanism, SENSOR_SIZE, SIZE, SensorModel, UPPER,
 };
 pub use learner::{DeclaredPhysics, DynamicsInput, DynamicsLearner, WindowInference};
+pub use residual::WindowResidual;
 pub use posterior::{DynamicsPosterior, JointDynamics, PartDynamics};

@@ -3,7 +3,7 @@
 use nalgebra::DMatrix;
 
 use super::batch::{BatchWindow, Hypothesis};
-use super::layout::{AddedEffect, JointScales, Mechanism, SENSOR_SIZE, SIZE};
+use super::layout::{AddedEffect, JointScales, LOWER, Mechanism, SENSOR_SIZE, SIZE, UPPER};
 use super::learner::{
     Block, DynamicsInput, DynamicsLearner, Warm, added_effect, extended, kinematics_of, standard_sensor, travel_of,
 };
@@ -98,11 +98,18 @@ impl DynamicsLearner {
         self.sensor = hypothesis.mechanism.sensor;
         self.sensor_prior = sensor_prior.cloned();
         let labels: Vec<Label> = hypothesis.mechanism.joints.iter().map(|m| m.joint.child).collect();
-        for model in &hypothesis.mechanism.joints {
+        for (k, model) in hypothesis.mechanism.joints.iter().enumerate() {
             if let Some(memory) = self.joints.get_mut(&model.joint.child) {
                 memory.friction = model.friction;
                 memory.effects.clone_from(&model.effects);
                 memory.tables.clone_from(&model.tables);
+                memory.stops = model.stops;
+                let offset = hypothesis.mechanism.offset(k);
+                for (side, place) in [LOWER, UPPER].into_iter().enumerate().filter(|(side, _)| model.stops[*side]) {
+                    let place = offset + place;
+                    let prior = &hypothesis.prior;
+                    memory.stop_positions[side] = prior.information[place] / prior.precision[(place, place)];
+                }
             }
         }
         for label in labels {

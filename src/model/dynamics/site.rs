@@ -44,8 +44,6 @@ pub struct WindowFit<'a> {
 /// A fitted window.
 #[derive(Clone, Debug)]
 pub struct FittedWindow {
-    /// The entries of the full parameter vector that were fitted.
-    pub active: Vec<usize>,
     /// The optimum of them.
     pub solution: Solution,
     /// κ.
@@ -154,7 +152,6 @@ impl WindowFit<'_> {
             }
             let innovations = problem.latest;
             return Ok(FittedWindow {
-                active: self.active.clone(),
                 reduction: reduction(&innovations.whitened, self.source.moving.len()),
                 noise_scale: scale,
                 log_predictive: solution.log_evidence - innovations.half_log_determinant - scale_cost(scale),
