@@ -67,13 +67,26 @@ impl Critic {
         let labels: Vec<Label> = fit.joints.iter().map(|joint| joint.child).collect();
         let (joints, sensor) = learner.numbers()?;
         let known = self.known.as_ref().filter(|(of, _)| *of == labels);
+        let known_joints = known.is_some();
         let added = known.map_or_else(BTreeMap::new, |(_, numbers)| numbers.added.clone());
         let numbers = Numbers { joints, sensor, added };
         let (selected, findings) = {
             let workshop =
                 Workshop { learner, fit, input, rest_prior: rest_prior.clone(), sensor_scales: SENSOR_SCALES, spans };
-            let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref() };
+            let found = self.selection.as_ref().filter(|_| known_joints).map(|s| s.additions.clone()).unwrap_or_default();
+            let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref(), found: &found };
             let base = selector.base(&numbers)?;
+            for (component, w) in base.components.iter().flat_map(|c| c.windows.iter().map(move |w| (c, *w))) {
+                let at = component.windows.iter().position(|o| *o == w).unwrap_or(0);
+                if let Some(f) = component.fitted.as_ref().filter(|f| f.windows[at].noise_scale > 1e3) {
+                    let h = workshop.hypothesis(&base.additions)?;
+                    let r = h.window(&batch[w], 3.0).linearize(&f.x, &[])?;
+                    let s = &batch[w].track.samples;
+                    let n = batch[w].moving.len();
+                    let big: Vec<(f64, f64)> = r.whitened.iter().enumerate().filter(|(_, e)| e.abs() > 5.0).map(|(i, e)| (batch[w].track.observations[i / n].time_s, *e)).collect();
+                    tracing::debug!(index = batch[w].index, from = ?s.first().map(|s| s.stamp_s), to = ?s.last().map(|s| s.stamp_s), ?big, "bad window");
+                }
+            }
             tracing::debug!(evidence = base.log_evidence, additions = ?base.additions, kappa = ?noise_scales(&base, &batch), "base");
             let before = scores(&workshop, &batch, &base).unwrap_or_default();
             let selected = selector.select(base.clone())?;

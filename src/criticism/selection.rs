@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::numbers::{Addition, Numbers, Workshop};
 use super::rest::RestReadings;
-use super::signature::{Ranked, probes, start_by_direction};
+use super::signature::{Probes, Ranked, probes, start_by_direction};
 use crate::inference::Failure;
 use crate::mechanism::effects::{EffectKind, TableKind};
 use crate::model::{BatchFit, BatchWindow, Hypothesis};
@@ -21,6 +21,8 @@ const WORTH_A_REFIT: f64 = 3.0;
 const MOST: usize = 4;
 /// A stop is believed from this gain on.
 const STOP_GAIN: f64 = 4.0;
+/// Rank of what was found before.
+const KNOWN: f64 = 1e9;
 /// A delay is tried from these \[scales\]: the motion's dependence on it is far from linear.
 const DELAYS: [f64; 4] = [-0.8, 0.3, 1.0, 2.0];
 /// Linearizations of a refit, and how often κ is chosen anew.
@@ -40,6 +42,8 @@ pub struct Selection {
     /// For every addition accepted: the log evidence of the model without it, and of those with
     /// another in its place.
     pub rivals: BTreeMap<Addition, Vec<(Option<Addition>, f64)>>,
+    /// What tables would gain over the model at first order \[nats\], most first.
+    pub leftover: Vec<(Addition, f64)>,
     /// Linearizations of all windows spent.
     pub steps: usize,
 }
@@ -86,11 +90,15 @@ pub struct Selector<'a> {
     pub batch: &'a [BatchWindow],
     /// What the sensor read at rest.
     pub rest: Option<&'a RestReadings>,
+    /// What the last review found: joints that the newest window does not concern are only asked for it.
+    pub found: &'a BTreeSet<Addition>,
 }
 
 /// A refitted candidate.
 struct Trial {
     addition: Addition,
+    /// All of its model.
+    additions: BTreeSet<Addition>,
     gain: f64,
     hypothesis: Hypothesis,
     fits: Vec<(Vec<usize>, BatchFit)>,
@@ -111,6 +119,7 @@ impl Selector<'_> {
             components: components(self.batch, together),
             log_evidence: self.sensor_evidence(additions),
             rivals: BTreeMap::new(),
+            leftover: Vec::new(),
             steps: 0,
         };
         for component in &mut selection.components {
@@ -181,7 +190,8 @@ impl Selector<'_> {
         let declared = self.workshop.learner.declared_mechanism();
         let friction_declared = declared.joints.iter().all(|joint| joint.friction);
         while current.rivals.len() < MOST * declared.joints.len().max(1) {
-            let ranked = self.ranked(&current, friction_declared)?;
+            let (ranked, leftover) = self.ranked(&current, friction_declared)?;
+            current.leftover = leftover;
             let candidates = ranked.len().max(1) as f64;
             let mut trials: Vec<Trial> = Vec::new();
             for candidate in self.shortlist(&ranked) {
@@ -223,7 +233,7 @@ impl Selector<'_> {
         }
         let mut with_first = current.clone();
         self.take(&mut with_first, first);
-        let ranked = self.ranked(&with_first, friction_declared)?;
+        let (ranked, _) = self.ranked(&with_first, friction_declared)?;
         let candidates = ranked.len().max(1) as f64;
         for candidate in self.shortlist(&ranked).into_iter().take(2) {
             let Ok(second) = self.best_trial(&with_first, &candidate) else { continue };
@@ -259,17 +269,32 @@ impl Selector<'_> {
         self.trial(from, &start, REFIT)
     }
 
-    /// Everything that might be added, by joint.
-    fn ranked(&self, current: &Selection, friction_declared: bool) -> Result<Vec<Ranked>, Failure> {
+    /// Everything that might be added, by joint, and what tables would gain.
+    fn ranked(&self, current: &Selection, friction_declared: bool) -> Result<(Vec<Ranked>, Vec<(Addition, f64)>), Failure> {
         let hypothesis = self.workshop.hypothesis(&current.additions)?;
         let mut ranked: Vec<Ranked> = Vec::new();
+        let mut leftover: Vec<(Addition, f64)> = Vec::new();
+        let newest = self.batch.iter().map(|w| w.index).max();
         let mut of_sensor: BTreeMap<Addition, Ranked> = BTreeMap::new();
         for component in &current.components {
             let Some(fitted) = &component.fitted else { continue };
             let windows = self.windows(&component.windows);
-            let moved = component.joints.iter().filter(|joint| windows.iter().any(|w| w.moving.contains(joint)));
-            for (k, &joint) in moved.enumerate() {
+            let moved: Vec<usize> = component
+                .joints
+                .iter()
+                .copied()
+                .filter(|joint| windows.iter().any(|w| w.moving.contains(joint)))
+                .collect();
+            let concerned = windows.iter().any(|w| Some(w.index) == newest);
+            let known = self.found.iter().filter(|a| a.joint().is_none_or(|joint| moved.contains(&joint)));
+            let known = known.filter(|a| !current.additions.contains(a) && !matches!(a, Addition::Stop(..)));
+            for addition in known.copied() {
+                let start = current.numbers.added.get(&addition).cloned().unwrap_or_default();
+                ranked.push(Ranked { addition, gain: KNOWN, start });
+            }
+            for (k, &joint) in moved.iter().filter(|_| concerned).enumerate() {
                 let [own, sensor] = probes(self.workshop, &hypothesis, fitted, &windows, joint)?;
+                leftover.extend(self.leftover(&own, joint));
                 ranked.extend(own.rank(&current.additions, friction_declared));
                 if k > 0 {
                     continue;
@@ -281,7 +306,9 @@ impl Selector<'_> {
             }
         }
         ranked.extend(of_sensor.into_values());
-        Ok(ranked)
+        // What was found before is tried from where it was, and anew.
+        leftover.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+        Ok((ranked, leftover))
     }
 
     /// The best few of every joint, and the sensor's.
@@ -305,6 +332,8 @@ impl Selector<'_> {
         let addition = candidate.addition;
         let mut additions = current.additions.clone();
         additions.insert(addition);
+        // What pulls towards the closed position leans on its stop, which shows only now.
+        let stop = self.closed_stop(addition).filter(|stop| additions.insert(*stop));
         let hypothesis = self.workshop.hypothesis(&additions)?;
         let mut numbers = current.numbers.clone();
         let mut start = candidate.start.clone();
@@ -315,6 +344,10 @@ impl Selector<'_> {
             start = start_by_direction(&numbers.joints[joint], &start, kind, &effect.scales);
         }
         numbers.added.insert(addition, start);
+        if let Some(Addition::Stop(joint, upper)) = stop {
+            let (low, high) = self.workshop.range(joint);
+            numbers.added.insert(Addition::Stop(joint, upper), vec![if upper { high } else { low }]);
+        }
         let x = numbers.laid_out(&hypothesis, &additions);
         let concerned: Vec<&Component> = match addition.joint() {
             Some(joint) => current.components.iter().filter(|c| c.joints.contains(&joint)).collect(),
@@ -333,11 +366,34 @@ impl Selector<'_> {
         let fitted = hypothesis.fit(&self.windows(&places), &x, &scales, effort)?;
         let rest = self.sensor_evidence(&additions) - self.sensor_evidence(&current.additions);
         let gain = fitted.log_evidence - before + rest;
-        Ok(Trial { addition, gain, hypothesis, fits: vec![(places, fitted)] })
+        Ok(Trial { addition, additions, gain, hypothesis, fits: vec![(places, fitted)] })
+    }
+
+    /// The stop at the closed end, if the effect pulls there and the joint was there.
+    fn closed_stop(&self, addition: Addition) -> Option<Addition> {
+        let joint = match addition {
+            Addition::Effect(
+                joint,
+                EffectKind::Catch
+                | EffectKind::SoftClose
+                | EffectKind::Spring
+                | EffectKind::SelfClosing
+                | EffectKind::GravityOffset
+                | EffectKind::AsymmetricFriction,
+            ) => joint,
+            _ => return None,
+        };
+        let scales = self.workshop.learner.joint_scales(joint, self.workshop.fit)?;
+        let (low, high) = self.workshop.range(joint);
+        let upper = scales.travel < 0.0;
+        let end = if upper { high } else { low };
+        let declared = self.workshop.learner.declared_mechanism();
+        let new = !declared.joints[joint].stops[usize::from(upper)] && end.abs() < 0.05 * scales.travel.abs();
+        new.then_some(Addition::Stop(joint, upper))
     }
 
     fn take(&self, current: &mut Selection, trial: &Trial) {
-        current.additions.insert(trial.addition);
+        current.additions.clone_from(&trial.additions);
         for (places, fitted) in &trial.fits {
             let together = current.additions.iter().any(|a| a.joint().is_none());
             if together {
@@ -388,8 +444,8 @@ impl Selector<'_> {
         Ok(())
     }
 
-    /// The table that explains most of what is left on a joint, with its gain over the model.
-    pub fn leftover(&self, current: &Selection) -> Result<Vec<(Addition, f64)>, Failure> {
+    /// What each table would gain over the model on a joint.
+    fn leftover(&self, own: &Probes, joint: usize) -> Vec<(Addition, f64)> {
         const KINDS: [(TableKind, f64, f64); 6] = [
             (TableKind::ForceOverPosition, 0.3, 0.3),
             (TableKind::ForceOverRate, 0.3, 1.0),
@@ -398,34 +454,21 @@ impl Selector<'_> {
             (TableKind::InertiaOverPosition, 0.2, 0.3),
             (TableKind::ForceOverTime, 0.3, 0.5),
         ];
-        let hypothesis = self.workshop.hypothesis(&current.additions)?;
-        let mut found = Vec::new();
-        for component in &current.components {
-            let Some(fitted) = &component.fitted else { continue };
-            let windows = self.windows(&component.windows);
-            let moved = component.joints.iter().filter(|joint| windows.iter().any(|w| w.moving.contains(joint)));
-            for &joint in moved {
-                let [own, _] = probes(self.workshop, &hypothesis, fitted, &windows, joint)?;
-                let Some(scales) = self.workshop.learner.joint_scales(joint, self.workshop.fit) else { continue };
-                for (kind, deviation, correlation) in KINDS {
-                    let length = match kind {
-                        TableKind::ForceOverRate => correlation * scales.rate,
-                        TableKind::FrictionOverTime | TableKind::ForceOverTime => correlation,
-                        _ => correlation * scales.travel.abs(),
-                    };
-                    if let Some(gain) = own.table_gain(kind, deviation, length) {
-                        found.push((Addition::Table(joint, kind), gain));
-                    }
-                }
-            }
-        }
-        found.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
-        Ok(found)
+        let Some(scales) = self.workshop.learner.joint_scales(joint, self.workshop.fit) else { return Vec::new() };
+        let gains = KINDS.iter().filter_map(|&(kind, deviation, correlation)| {
+            let length = match kind {
+                TableKind::ForceOverRate => correlation * scales.rate,
+                TableKind::FrictionOverTime | TableKind::ForceOverTime => correlation,
+                _ => correlation * scales.travel.abs(),
+            };
+            Some((Addition::Table(joint, kind), own.table_gain(kind, deviation, length)?))
+        });
+        gains.collect()
     }
 
     /// Adds the tables that what is left calls for; the named ones that then gain nothing go.
     pub fn describe_leftover(&self, mut current: Selection) -> Result<Selection, Failure> {
-        let leftover = self.leftover(&current)?;
+        let leftover = current.leftover.clone();
         tracing::debug!(?leftover, "leftover");
         let mut described: BTreeSet<usize> = BTreeSet::new();
         for (addition, gain) in leftover {
