@@ -91,7 +91,8 @@ fn parameters(
         Addition::Stop(..) => {}
         Addition::Friction(_) => {
             let unit = Dimension::Force.unit(joint_type);
-            let quantity = Quantity::from_log_normal(unit, mean[0], deviation(0).hypot(MODEL_FLOOR), informed(deviation(0)));
+            let quantity =
+                Quantity::from_log_normal(unit, mean[0], deviation(0).hypot(MODEL_FLOOR), informed(deviation(0)));
             all.insert("friction".to_owned(), quantity);
         }
         Addition::Effect(joint, kind) => {
@@ -136,8 +137,12 @@ fn parameters(
             for (k, node) in table.nodes.iter().enumerate() {
                 let sign = if turned && what == "force" { -1.0 } else { 1.0 };
                 let node = if turned { -node } else { *node };
-                let quantity =
-                    Quantity::from_normal(unit, sign * mean[k] * table.scale, deviation(k) * table.scale, informed(deviation(k)));
+                let quantity = Quantity::from_normal(
+                    unit,
+                    sign * mean[k] * table.scale,
+                    deviation(k) * table.scale,
+                    informed(deviation(k)),
+                );
                 all.insert(format!("{what}_at_{over}_{node:.4}"), quantity);
             }
         }
@@ -150,7 +155,8 @@ fn parameters(
                     _ if k < 3 => (names[k], "N", force),
                     _ => (names[k], "N·m", torque),
                 };
-                let quantity = Quantity::from_normal(unit, mean[k] * scale, deviation(k) * scale, informed(deviation(k)));
+                let quantity =
+                    Quantity::from_normal(unit, mean[k] * scale, deviation(k) * scale, informed(deviation(k)));
                 all.insert(name.to_owned(), quantity);
             }
         }

@@ -73,20 +73,10 @@ impl Critic {
         let (selected, findings) = {
             let workshop =
                 Workshop { learner, fit, input, rest_prior: rest_prior.clone(), sensor_scales: SENSOR_SCALES, spans };
-            let found = self.selection.as_ref().filter(|_| known_joints).map(|s| s.additions.clone()).unwrap_or_default();
+            let found =
+                self.selection.as_ref().filter(|_| known_joints).map(|s| s.additions.clone()).unwrap_or_default();
             let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref(), found: &found };
             let base = selector.base(&numbers)?;
-            for (component, w) in base.components.iter().flat_map(|c| c.windows.iter().map(move |w| (c, *w))) {
-                let at = component.windows.iter().position(|o| *o == w).unwrap_or(0);
-                if let Some(f) = component.fitted.as_ref().filter(|f| f.windows[at].noise_scale > 1e3) {
-                    let h = workshop.hypothesis(&base.additions)?;
-                    let r = h.window(&batch[w], 3.0).linearize(&f.x, &[])?;
-                    let s = &batch[w].track.samples;
-                    let n = batch[w].moving.len();
-                    let big: Vec<(f64, f64)> = r.whitened.iter().enumerate().filter(|(_, e)| e.abs() > 5.0).map(|(i, e)| (batch[w].track.observations[i / n].time_s, *e)).collect();
-                    tracing::debug!(index = batch[w].index, from = ?s.first().map(|s| s.stamp_s), to = ?s.last().map(|s| s.stamp_s), ?big, "bad window");
-                }
-            }
             tracing::debug!(evidence = base.log_evidence, additions = ?base.additions, kappa = ?noise_scales(&base, &batch), "base");
             let before = scores(&workshop, &batch, &base).unwrap_or_default();
             let selected = selector.select(base.clone())?;
@@ -103,7 +93,13 @@ impl Critic {
             }
             tracing::debug!(evidence = selected.log_evidence, steps = selected.steps, additions = ?selected.additions,
                 kappa = ?noise_scales(&selected, &batch), before = before.log_predictive_density, after = after.log_predictive_density, "selected");
-            let named = selected.additions.iter().any(|a| !matches!(a, Addition::Stop(..)) && a.name() != "unknown");
+            // What weighs most decides: a name beside a stronger unknown explains little.
+            let loss = |addition: &Addition| {
+                let rivals = selected.rivals.get(addition)?;
+                rivals.iter().find(|(rival, _)| rival.is_none()).map(|(_, difference)| -difference)
+            };
+            let found = selected.additions.iter().filter_map(|a| Some((loss(a)?, a)));
+            let named = found.max_by(|a, b| a.0.total_cmp(&b.0)).is_some_and(|(_, a)| a.name() != "unknown");
             let verdict = match () {
                 () if before.windows < 2 => Verdict::Insufficient,
                 () if named => Verdict::EffectFound,
@@ -119,15 +115,9 @@ impl Critic {
             let additions = if found { selected.additions.clone() } else { BTreeSet::new() };
             let scales = noise_scales(&selected, &batch);
             let spans = input.windows.iter().filter_map(|w| Some([*w.times_s.first()?, *w.times_s.last()?])).collect();
-            let hypothesis = Workshop {
-                learner,
-                fit,
-                input,
-                rest_prior: rest_prior.clone(),
-                sensor_scales: SENSOR_SCALES,
-                spans,
-            }
-            .hypothesis(&additions)?;
+            let hypothesis =
+                Workshop { learner, fit, input, rest_prior: rest_prior.clone(), sensor_scales: SENSOR_SCALES, spans }
+                    .hypothesis(&additions)?;
             let x = selected.numbers.laid_out(&hypothesis, &additions);
             let prior = rest_prior.as_ref().filter(|_| additions.contains(&Addition::Bias));
             learner.adopt(&hypothesis, &x, &scales, prior, (fit, input))?;

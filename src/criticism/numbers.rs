@@ -5,8 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use crate::inference::{Failure, Gaussian};
 use crate::mechanism::effects::{EffectKind, TableKind};
 use crate::model::{
-    AddedTable, DynamicsInput, DynamicsLearner, FRICTION, Hypothesis, JointScales, KinematicFit, LIMIT_DEVIATION, LOWER,
-    SENSOR_SIZE, SIZE, UPPER,
+    AddedTable, DynamicsInput, DynamicsLearner, FRICTION, Hypothesis, JointScales, KinematicFit, LIMIT_DEVIATION,
+    LOWER, SENSOR_SIZE, SIZE, UPPER,
 };
 
 /// One effect beyond the declared model; joints by index in the fit.
@@ -30,7 +30,9 @@ impl Addition {
     /// The joint that it acts on; none for the sensor's.
     pub fn joint(self) -> Option<usize> {
         match self {
-            Self::Stop(joint, _) | Self::Friction(joint) | Self::Effect(joint, _) | Self::Table(joint, _) => Some(joint),
+            Self::Stop(joint, _) | Self::Friction(joint) | Self::Effect(joint, _) | Self::Table(joint, _) => {
+                Some(joint)
+            }
             Self::Bias | Self::Delay => None,
         }
     }
@@ -148,8 +150,7 @@ impl Workshop<'_> {
 
     /// The least and the greatest position of a joint \[m or rad\].
     pub fn range(&self, joint: usize) -> (f64, f64) {
-        let all = self.fit.positions.iter().flat_map(|window| window[joint].iter().copied());
-        all.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), q| (l.min(q), h.max(q)))
+        self.learner.range_of(joint, self.fit)
     }
 }
 

@@ -84,7 +84,12 @@ fn sequence(
         let usual = sorted[sorted.len() / 2];
         let mut posterior = hypothesis.clone();
         posterior.prior = learned_prior(hypothesis, &learned)?;
-        let fresh = posterior.fit(&[window], &x, &[usual], (4, 1))?;
+        // The mode of what the window says is sought from what was known and from what is known now.
+        let now = numbers.laid_out(hypothesis, additions);
+        let fits = [(&x, usual), (&now, whole.windows[k].noise_scale)]
+            .map(|(start, scale)| posterior.fit(&[window], start, &[scale], (4, 1)));
+        let best = fits.into_iter().flatten().max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence));
+        let fresh = best.ok_or(Failure::Diverged)?;
         let log_density = fresh.log_evidence - 0.5 * fresh.windows[0].observations as f64 * std::f64::consts::TAU.ln();
         let residual = hypothesis.window(window, usual).residual(&x)?;
         scored.push(Scored { window: w, log_density, residual });

@@ -21,6 +21,11 @@ const WORTH_A_REFIT: f64 = 3.0;
 const MOST: usize = 4;
 /// A stop is believed from this gain on.
 const STOP_GAIN: f64 = 4.0;
+/// A pulse may be anywhere: it counts as this many candidates.
+const PLACES: f64 = 150.0;
+/// κ from which on a window is not explained, and how many tables are then tried in any case.
+const MISFIT: f64 = 10.0;
+const TABLES_TRIED: usize = 4;
 /// Rank of what was found before.
 const KNOWN: f64 = 1e9;
 /// A delay is tried from these \[scales\]: the motion's dependence on it is far from linear.
@@ -110,7 +115,12 @@ impl Selector<'_> {
     }
 
     /// The model with these additions and no others.
-    pub fn fitted(&self, additions: &BTreeSet<Addition>, numbers: &Numbers, effort: (usize, usize)) -> Result<Selection, Failure> {
+    pub fn fitted(
+        &self,
+        additions: &BTreeSet<Addition>,
+        numbers: &Numbers,
+        effort: (usize, usize),
+    ) -> Result<Selection, Failure> {
         let together = additions.iter().any(|a| a.joint().is_none());
         let hypothesis = self.workshop.hypothesis(additions)?;
         let mut selection = Selection {
@@ -203,8 +213,12 @@ impl Selector<'_> {
             }
             trials.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.addition.cmp(&b.addition)));
             let least = LEAST_GAIN + candidates.ln();
-            let Some(best) = trials.first() else { break };
-            if best.gain < least {
+            let needs = |trial: &Trial| match trial.addition {
+                Addition::Effect(_, EffectKind::Impulse) => least + PLACES.ln(),
+                _ => least,
+            };
+            let Some(best) = trials.iter().find(|trial| trial.gain > needs(trial)).or(trials.first()) else { break };
+            if best.gain < needs(best) {
                 // A right effect can gain nothing until its partner is in.
                 match self.pair(&current, best, friction_declared, least)? {
                     Some(pair) => current = pair,
@@ -227,7 +241,13 @@ impl Selector<'_> {
     }
 
     /// The model with the best candidate and the best partner of it, if the two gain enough.
-    fn pair(&self, current: &Selection, first: &Trial, friction_declared: bool, least: f64) -> Result<Option<Selection>, Failure> {
+    fn pair(
+        &self,
+        current: &Selection,
+        first: &Trial,
+        friction_declared: bool,
+        least: f64,
+    ) -> Result<Option<Selection>, Failure> {
         if first.gain < 0.0 {
             return Ok(None);
         }
@@ -270,7 +290,11 @@ impl Selector<'_> {
     }
 
     /// Everything that might be added, by joint, and what tables would gain.
-    fn ranked(&self, current: &Selection, friction_declared: bool) -> Result<(Vec<Ranked>, Vec<(Addition, f64)>), Failure> {
+    fn ranked(
+        &self,
+        current: &Selection,
+        friction_declared: bool,
+    ) -> Result<(Vec<Ranked>, Vec<(Addition, f64)>), Failure> {
         let hypothesis = self.workshop.hypothesis(&current.additions)?;
         let mut ranked: Vec<Ranked> = Vec::new();
         let mut leftover: Vec<(Addition, f64)> = Vec::new();
@@ -300,7 +324,9 @@ impl Selector<'_> {
                     continue;
                 }
                 for candidate in sensor.rank(&current.additions, friction_declared) {
-                    let entry = of_sensor.entry(candidate.addition).or_insert_with(|| Ranked { gain: 0.0, ..candidate.clone() });
+                    let entry = of_sensor
+                        .entry(candidate.addition)
+                        .or_insert_with(|| Ranked { gain: 0.0, ..candidate.clone() });
                     entry.gain += candidate.gain;
                 }
             }
@@ -320,7 +346,9 @@ impl Selector<'_> {
         let mut shortlist: Vec<Ranked> = Vec::new();
         for mut candidates in by_place.into_values() {
             candidates.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.addition.cmp(&b.addition)));
-            let rest = |c: &Ranked| c.addition == Addition::Bias && self.sensor_evidence(&BTreeSet::from([Addition::Bias])) > 0.0;
+            let rest = |c: &Ranked| {
+                c.addition == Addition::Bias && self.sensor_evidence(&BTreeSet::from([Addition::Bias])) > 0.0
+            };
             let worth = candidates.iter().filter(|c| c.gain > WORTH_A_REFIT || rest(c)).take(REFITTED);
             shortlist.extend(worth.map(|c| (*c).clone()));
         }
@@ -429,13 +457,22 @@ impl Selector<'_> {
     fn drop_what_is_not_needed(&self, current: &mut Selection, newest: Addition) -> Result<(), Failure> {
         let is_stop = |a: &Addition| matches!(a, Addition::Stop(..));
         let others: Vec<Addition> = current.additions.iter().copied().filter(|a| *a != newest && !is_stop(a)).collect();
-        for addition in others.into_iter().filter(|a| a.joint().is_none() || newest.joint().is_none() || a.joint() == newest.joint()) {
+        for addition in others
+            .into_iter()
+            .filter(|a| a.joint().is_none() || newest.joint().is_none() || a.joint() == newest.joint())
+        {
             let mut fewer = current.additions.clone();
             fewer.remove(&addition);
             let without = self.fitted(&fewer, &current.numbers, (6, 1))?;
             current.steps += without.steps;
             tracing::debug!(?addition, loss = current.log_evidence - without.log_evidence, "without");
-            if without.log_evidence > current.log_evidence - LEAST_GAIN {
+            // A name that a table made nearly needless was a wrong one.
+            let of_newest = current.rivals.get(&newest).and_then(|r| r.iter().find(|(rival, _)| rival.is_none()));
+            let least = match (newest, of_newest) {
+                (Addition::Table(..), Some((_, loss))) => LEAST_GAIN.max(-0.5 * loss),
+                _ => LEAST_GAIN,
+            };
+            if without.log_evidence > current.log_evidence - least {
                 let (mut rivals, steps) = (std::mem::take(&mut current.rivals), current.steps);
                 rivals.remove(&addition);
                 *current = Selection { rivals, steps, ..without };
@@ -470,24 +507,40 @@ impl Selector<'_> {
     pub fn describe_leftover(&self, mut current: Selection) -> Result<Selection, Failure> {
         let leftover = current.leftover.clone();
         tracing::debug!(?leftover, "leftover");
-        let mut described: BTreeSet<usize> = BTreeSet::new();
+        let mut best: BTreeMap<usize, (f64, Trial)> = BTreeMap::new();
+        let mut tried: BTreeMap<usize, usize> = BTreeMap::new();
         for (addition, gain) in leftover {
             let Some(joint) = addition.joint() else { continue };
-            if gain < LEAST_TABLE_GAIN || described.contains(&joint) {
+            // Where κ is large nothing gains much at first order.
+            let count = tried.entry(joint).or_default();
+            if *count >= TABLES_TRIED || (gain < LEAST_TABLE_GAIN && !misfits(&current, joint)) {
                 continue;
             }
+            *count += 1;
             let trial = self.trial(&current, &Ranked { addition, gain, start: Vec::new() }, REFIT);
             let Ok(trial) = trial else { continue };
+            current.steps += trial.fits.iter().map(|(_, f)| f.steps).sum::<usize>();
             tracing::debug!(?addition, gain, refitted = trial.gain, "table");
-            if trial.gain > LEAST_TABLE_GAIN {
-                described.insert(joint);
-                self.take(&mut current, &trial);
-                current.rivals.insert(addition, vec![(None, -trial.gain)]);
-                self.drop_what_is_not_needed(&mut current, addition)?;
+            if trial.gain > LEAST_TABLE_GAIN && best.get(&joint).is_none_or(|(other, _)| trial.gain > *other) {
+                best.insert(joint, (trial.gain, trial));
             }
+        }
+        for (gain, trial) in best.into_values() {
+            // The layout may have changed since.
+            let addition = trial.addition;
+            let trial = self.trial(&current, &Ranked { addition, gain, start: Vec::new() }, REFIT)?;
+            self.take(&mut current, &trial);
+            current.rivals.insert(addition, vec![(None, -trial.gain)]);
+            self.drop_what_is_not_needed(&mut current, addition)?;
         }
         Ok(current)
     }
+}
+
+/// Whether a window that moves a joint needs far more process noise than the sensor explains.
+fn misfits(current: &Selection, joint: usize) -> bool {
+    let concerned = current.components.iter().filter(|c| c.joints.contains(&joint));
+    concerned.filter_map(|c| c.fitted.as_ref()).flat_map(|f| &f.windows).any(|w| w.noise_scale >= MISFIT)
 }
 
 /// Whether two additions compete to explain the same.

@@ -146,7 +146,14 @@ pub fn probes(
     let (sensor_hessian, sensor_gradient) = part(&of_sensor);
     Ok([
         Probes { joint: Some(joint), scales, duration_s, tables, hessian: joint_hessian, gradient: joint_gradient },
-        Probes { joint: None, scales, duration_s, tables: Vec::new(), hessian: sensor_hessian, gradient: sensor_gradient },
+        Probes {
+            joint: None,
+            scales,
+            duration_s,
+            tables: Vec::new(),
+            hessian: sensor_hessian,
+            gradient: sensor_gradient,
+        },
     ])
 }
 
@@ -264,9 +271,8 @@ impl Probes {
     pub fn table_gain(&self, kind: TableKind, deviation: f64, correlation: f64) -> Option<f64> {
         let (_, nodes, first) = self.tables.iter().find(|(own, _, _)| *own == kind)?;
         let n = nodes.len();
-        let covariance = DMatrix::from_fn(n, n, |i, j| {
-            deviation * deviation * (-(nodes[i] - nodes[j]).abs() / correlation).exp()
-        });
+        let covariance =
+            DMatrix::from_fn(n, n, |i, j| deviation * deviation * (-(nodes[i] - nodes[j]).abs() / correlation).exp());
         let hessian = self.hessian.view((*first, *first), (n, n)).into_owned();
         let gradient = self.gradient.rows(*first, n).into_owned();
         let precision = covariance.clone().cholesky()?.inverse();
@@ -302,9 +308,8 @@ impl Probes {
             let best = self.best_of(*kind, &scales);
             if let Some((gain, physical)) = best {
                 let laws = kind.parameters().iter().zip(&physical);
-                let start = laws
-                    .map(|(p, value)| p.unconstrained(*value, &scales).unwrap_or(-2.0).clamp(-2.5, 2.5))
-                    .collect();
+                let start =
+                    laws.map(|(p, value)| p.unconstrained(*value, &scales).unwrap_or(-2.0).clamp(-2.5, 2.5)).collect();
                 ranked.push(Ranked { addition, gain, start });
             }
         }
@@ -318,7 +323,12 @@ impl Probes {
         let absent = groups.into_iter().filter(|(addition, _)| !present.contains(addition));
         let mut at = 0;
         for (addition, range) in absent {
-            let signatures: Vec<DVector<f64>> = range.map(|_| { at += 1; unit(at - 1) }).collect();
+            let signatures: Vec<DVector<f64>> = range
+                .map(|_| {
+                    at += 1;
+                    unit(at - 1)
+                })
+                .collect();
             if let Some((gain, amplitudes)) = self.regress(&signatures) {
                 let start = amplitudes.iter().map(|a| a.clamp(-2.0, 2.0)).collect();
                 ranked.push(Ranked { addition, gain, start });
@@ -403,9 +413,7 @@ impl Probes {
             EffectKind::Stribeck => {
                 for rate in [0.03, 0.07, 0.15, 0.3].map(|r| r * scales.rate) {
                     let law = |v: f64| if v == 0.0 { 0.0 } else { -v.signum() * (-(v / rate).powi(2)).exp() };
-                    offer(&[self.rate_force(law)], &|a| {
-                        (a[0] > 0.0).then(|| vec![a[0] + 0.3 * scales.force, rate])
-                    });
+                    offer(&[self.rate_force(law)], &|a| (a[0] > 0.0).then(|| vec![a[0] + 0.3 * scales.force, rate]));
                 }
             }
             EffectKind::AsymmetricFriction => {

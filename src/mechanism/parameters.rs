@@ -44,7 +44,15 @@ pub struct JointForces<T: Real> {
 impl<T: Real> JointParameters<T> {
     /// Damping \[N·s/m or N·m·s/rad\] and Coulomb friction \[N or N·m\], and nothing else.
     pub fn new(damping: T, friction: T) -> Self {
-        Self { damping, friction, armature: T::zero(), lower: None, upper: None, effects: Vec::new(), tables: Vec::new() }
+        Self {
+            damping,
+            friction,
+            armature: T::zero(),
+            lower: None,
+            upper: None,
+            effects: Vec::new(),
+            tables: Vec::new(),
+        }
     }
 
     /// All that the joint does at this state.

@@ -6,9 +6,10 @@ mod kinematics;
 mod window;
 
 pub use dynamics::{
-    AddedEffect, AddedTable, BatchFit, BatchWindow, BatchedWindow, DAMPING, DeclaredPhysics, DynamicsInput, DynamicsLearner,
-    DynamicsPosterior, FRICTION, Hypothesis, INERTIA, JointDynamics, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism, PartDynamics,
-    SENSOR_SIZE, SIZE, SensorModel, UPPER, WindowInference, WindowModel, WindowResidual,
+    AddedEffect, AddedTable, BatchFit, BatchWindow, BatchedWindow, DAMPING, DeclaredPhysics, DynamicsInput,
+    DynamicsLearner, DynamicsPosterior, FRICTION, Hypothesis, INERTIA, JointDynamics, JointModel, JointScales,
+    LIMIT_DEVIATION, LOWER, Mechanism, PartDynamics, SENSOR_SIZE, SIZE, SensorModel, UPPER, WindowInference,
+    WindowModel, WindowResidual,
 };
 pub use edges::{EdgeFit, EdgePart, axes_from_motion, moving_evidence, relative_windows, rigid_evidence};
 pub use kinematics::{Axis, KinematicFit, KinematicJoint, KinematicSettings, fit_kinematics};

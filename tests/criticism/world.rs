@@ -234,8 +234,7 @@ impl Record {
         } else {
             vec![object.clone()]
         };
-        let joints: Vec<KinematicJoint> =
-            objects.iter().enumerate().map(|(k, o)| o.kinematics(k as u32 + 1)).collect();
+        let joints: Vec<KinematicJoint> = objects.iter().enumerate().map(|(k, o)| o.kinematics(k as u32 + 1)).collect();
         let mut record = Self {
             hulls: joints.iter().map(|j| (j.child, hull(object.revolute, objects[0].inertia))).collect(),
             joints,
@@ -260,7 +259,11 @@ impl Record {
                 vec![here, -0.02 * travel, open[0], open[1]]
             };
             // The one that brakes is left open, then closed.
-            let way = if brakes && joint == 1 { vec![here, if w % 4 == 1 { 0.8 * travel } else { 0.02 * travel }] } else { way };
+            let way = if brakes && joint == 1 {
+                vec![here, if w % 4 == 1 { 0.8 * travel } else { 0.02 * travel }]
+            } else {
+                way
+            };
             let handling = Handling { start_s: w as f64 * WINDOW_EVERY_S, span_s, way };
             record.window(&objects, joint, &handling, &mut places, &mut travelled, rng);
         }
@@ -325,8 +328,8 @@ impl Record {
                 for axis in 0..3 {
                     information[(axis, axis)] *= 0.04;
                 }
-                let displacement = screw.displacement(q)
-                    * Pose::from_translation(Vector3::from_fn(|_, _| POSE_NOISE * normal(rng)));
+                let displacement =
+                    screw.displacement(q) * Pose::from_translation(Vector3::from_fn(|_, _| POSE_NOISE * normal(rng)));
                 poses.push(Some(PoseMeasurement { displacement, information }));
                 let moving = state.rates[0].abs() > 1e-4;
                 quiet = if touching || moving { 0 } else { quiet + 1 };
@@ -380,9 +383,8 @@ impl Record {
             let samples = [sample(stamp_s, force), sample(stamp_s + READING_S, 2.0 * force - force_before)];
             force_before = force;
             let tree = inertia.tree(parameters);
-            let run =
-                rollout(&tree, &state, &[WrenchTrack::new(0, &samples)], &[stamp_s, stamp_s + READING_S], 1e-3)
-                    .expect("finite");
+            let run = rollout(&tree, &state, &[WrenchTrack::new(0, &samples)], &[stamp_s, stamp_s + READING_S], 1e-3)
+                .expect("finite");
             *travelled += (run.positions(1)[0] - q).abs();
             state = State::new(run.positions(1).to_vec(), run.rates(1).to_vec());
         }
@@ -452,6 +454,7 @@ pub fn object(name: &str, size: f64, number: u64) -> (Object, ChaCha8Rng) {
     let salt = name.bytes().fold(7_u64, |sum, byte| sum.wrapping_mul(31).wrapping_add(u64::from(byte)));
     let mut rng = ChaCha8Rng::seed_from_u64(salt ^ (number << 32) ^ (size * 1000.0) as u64);
     let revolute = number % 2 == 0;
-    let object = if name == "plain" { Object::plain(&mut rng, revolute) } else { Object::with(&mut rng, revolute, name, size) };
+    let object =
+        if name == "plain" { Object::plain(&mut rng, revolute) } else { Object::with(&mut rng, revolute, name, size) };
     (object, rng)
 }

@@ -130,7 +130,8 @@ impl Hypothesis {
         let mut scales = scales.to_vec();
         let mut x = x.to_vec();
         let mut spent = 0;
-        let mut problem = Problem { hypothesis: self, windows, by_window, places, active, x, scales, latest: Vec::new() };
+        let mut problem =
+            Problem { hypothesis: self, windows, by_window, places, active, x, scales, latest: Vec::new() };
         for round in 0..=rounds {
             let start = DVector::from_iterator(problem.active.len(), problem.active.iter().map(|&i| problem.x[i]));
             let settings = SolverSettings { steps, ..SolverSettings::default() };
@@ -223,14 +224,12 @@ impl Problem<'_> {
 impl LeastSquares for Problem<'_> {
     fn linearize(&mut self, x: &DVector<f64>) -> Result<Linearization, Failure> {
         self.set(x);
-        let one = |w: usize| {
-            self.hypothesis.window(self.windows[w], self.scales[w]).linearize(&self.x, &self.by_window[w])
-        };
+        let one =
+            |w: usize| self.hypothesis.window(self.windows[w], self.scales[w]).linearize(&self.x, &self.by_window[w]);
         // Collected in the order of the windows, so that threads do not show in the sum.
         let all: Vec<Innovations> = (0..self.windows.len()).into_par_iter().map(one).collect::<Result<_, _>>()?;
         let n = self.active.len();
-        let mut sum =
-            Linearization { cost: 0.0, gradient: DVector::zeros(n), curvature: DMatrix::zeros(n, n) };
+        let mut sum = Linearization { cost: 0.0, gradient: DVector::zeros(n), curvature: DMatrix::zeros(n, n) };
         for (innovations, places) in all.iter().zip(&self.places) {
             let (curvature, gradient) = normal_equations(innovations, places.len());
             sum.cost += innovations.cost();

@@ -6,8 +6,8 @@ use nalgebra::{DMatrix, DVector, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::layout::{
-    AddedEffect, AddedTable, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism, SENSOR_SIZE, SIZE, SensorModel,
-    UPPER, joint_models,
+    AddedEffect, AddedTable, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism, SENSOR_SIZE, SIZE,
+    SensorModel, UPPER, joint_models,
 };
 use super::site::{FittedWindow, WindowFit, inertial_entries, load_factor};
 use super::track::{TrackKinematics, TrackSource, joint_track, touched_label};
@@ -573,7 +573,9 @@ impl DynamicsLearner {
         let prior = conditional.marginal(&active)?;
         let (start, covariance) = prior.moments()?;
         let starts = match warm {
-            Some(warm) => vec![DVector::from_fn(active.len(), |i, _| warm.x.get(active[i]).copied().unwrap_or(start[i]))],
+            Some(warm) => {
+                vec![DVector::from_fn(active.len(), |i, _| warm.x.get(active[i]).copied().unwrap_or(start[i]))]
+            }
             None => starts(&start, &covariance, &active, &self.mechanism, moving),
         };
         let noise_scale = warm.map(|w| w.noise_scale).or(self.windows[window].noise_scale);

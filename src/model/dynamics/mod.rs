@@ -19,8 +19,9 @@ mod track;
 pub use batch::{BatchFit, BatchWindow, BatchedWindow, Hypothesis};
 pub use innovations::WindowModel;
 pub use layout::{
-    AddedEffect, AddedTable, DAMPING, FRICTION, INERTIA, LIMIT_DEVIATION, LOWER, JointModel, JointScales, Mechanism, SENSOR_SIZE, SIZE, SensorModel, UPPER,
+    AddedEffect, AddedTable, DAMPING, FRICTION, INERTIA, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism,
+    SENSOR_SIZE, SIZE, SensorModel, UPPER,
 };
 pub use learner::{DeclaredPhysics, DynamicsInput, DynamicsLearner, WindowInference};
-pub use residual::WindowResidual;
 pub use posterior::{DynamicsPosterior, JointDynamics, PartDynamics};
+pub use residual::WindowResidual;

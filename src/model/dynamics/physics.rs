@@ -7,7 +7,7 @@ use super::layout::{AddedEffect, JointScales, LOWER, Mechanism, SENSOR_SIZE, SIZ
 use super::learner::{
     Block, DynamicsInput, DynamicsLearner, Warm, added_effect, extended, kinematics_of, standard_sensor, travel_of,
 };
-use super::track::joint_track;
+use super::track::{JointTrack, joint_track};
 use crate::inference::{Failure, Gaussian};
 use crate::mechanism::effects::EffectKind;
 use crate::model::KinematicFit;
@@ -24,7 +24,8 @@ impl DynamicsLearner {
             if moving.is_empty() || batch.iter().filter(|w| w.moving == moving).count() >= most {
                 continue;
             }
-            let Some(track) = joint_track(&self.source(index, &moving, fit, input), &kinematics) else { continue };
+            let Some(mut track) = joint_track(&self.source(index, &moving, fit, input), &kinematics) else { continue };
+            drop_spikes(&mut track);
             if track.observations.len() < 3 {
                 continue;
             }
@@ -51,8 +52,20 @@ impl DynamicsLearner {
     /// Typical force and rate of a joint, and the farthest that it went.
     pub fn joint_scales(&self, joint: usize, fit: &KinematicFit) -> Option<JointScales> {
         let scales = self.joints.get(&fit.joints.get(joint)?.child)?.scales?;
-        let all: Vec<f64> = fit.positions.iter().flat_map(|window| window[joint].iter().copied()).collect();
-        Some(JointScales { travel: travel_of(&all), ..scales })
+        let (low, high) = self.range_of(joint, fit);
+        Some(JointScales { travel: travel_of(&[low, high]), ..scales })
+    }
+
+    /// The least and the greatest position of a joint, a few frames aside: where a tool has let go
+    /// too late, they are off.
+    pub fn range_of(&self, joint: usize, fit: &KinematicFit) -> (f64, f64) {
+        let mut all: Vec<f64> = fit.positions.iter().flat_map(|window| window[joint].iter().copied()).collect();
+        all.sort_by(f64::total_cmp);
+        let aside = (all.len() / 100).min(4);
+        match (all.get(aside), all.len().checked_sub(1 + aside).and_then(|i| all.get(i))) {
+            (Some(low), Some(high)) if low <= high => (*low, *high),
+            _ => (0.0, 0.0),
+        }
     }
 
     /// An effect as it would be on a joint.
@@ -154,4 +167,35 @@ impl DynamicsLearner {
     pub fn mechanism(&self) -> &Mechanism {
         &self.mechanism
     }
+}
+
+/// Observations farther than this many usual ones, and this far, from the median of those around
+/// them are not of the part \[m or rad\]: a tool that let go before its contact was seen to end.
+const SPIKE: (f64, f64) = (15.0, 0.004);
+
+/// Leaves out observations that stand alone.
+fn drop_spikes(track: &mut JointTrack) {
+    let count = track.positions.len();
+    let joints = track.positions.first().map_or(0, |q| q.len());
+    let mut spikes = vec![false; count];
+    for joint in 0..joints {
+        let path: Vec<f64> = track.positions.iter().map(|q| q[joint]).collect();
+        let distance = |k: usize| {
+            let first = k.saturating_sub(2).min(count.saturating_sub(5));
+            let mut around = path[first..(first + 5).min(count)].to_vec();
+            around.sort_by(f64::total_cmp);
+            (path[k] - around[around.len() / 2]).abs()
+        };
+        let distances: Vec<f64> = (0..count).map(distance).collect();
+        let mut sorted = distances.clone();
+        sorted.sort_by(f64::total_cmp);
+        let usual = sorted.get(count / 2).copied().unwrap_or(0.0);
+        for (spike, distance) in spikes.iter_mut().zip(distances) {
+            *spike |= distance > (SPIKE.0 * usual).max(SPIKE.1);
+        }
+    }
+    let mut keep = spikes.iter().map(|spike| !spike);
+    track.observations.retain(|_| keep.next().unwrap_or(true));
+    let mut keep = spikes.iter().map(|spike| !spike);
+    track.positions.retain(|_| keep.next().unwrap_or(true));
 }
