@@ -13,7 +13,7 @@
 //! # Layers
 //! Each module may use those before it in this list, never those after it; `tests/layers.rs` is
 //! the wall: `math`, `types`, `geometry`, `registration`, `mechanism`, `structure`, `inference`,
-//! `model`, `tracking`, `pipeline`, `io`, `report`.
+//! `model`, `tracking`, `pipeline`, `io`, `report`, `ros`, `node`.
 
 pub mod criticism;
 pub mod geometry;
@@ -22,9 +22,11 @@ pub mod io;
 pub mod math;
 pub mod mechanism;
 pub mod model;
+pub mod node;
 pub mod pipeline;
 pub mod registration;
 pub mod report;
+pub mod ros;
 pub mod structure;
 pub mod tracking;
 pub mod types;

@@ -11,7 +11,7 @@ use std::{
 };
 
 /// From the innermost to the outermost; `cli` and `main` are the binary.
-const LAYERS: [&str; 17] = [
+const LAYERS: [&str; 18] = [
     "math",
     "types",
     "geometry",
@@ -26,6 +26,7 @@ const LAYERS: [&str; 17] = [
     "pipeline",
     "io",
     "report",
+    "ros",
     "node",
     "cli",
     "main",

@@ -1,16 +1,23 @@
 //! Subcommands, their options, logging.
 
+mod evaluate;
+mod node;
 mod progress;
+mod recording;
 mod replay;
 
 use std::io::{self, Write};
 
 use anyhow::Context;
+use bayesian_object_models::node::rosout::RosoutLayer;
+use bayesian_object_models::types::Label;
 use clap::{Parser, Subcommand};
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::{EnvFilter, layer::SubscriberExt, util::SubscriberInitExt};
 
 /// What is logged unless asked otherwise; what reading finds is in the table already.
 const DEFAULT_LOG: &str = "warn,bayesian_object_models::io=error";
+/// What the node logs unless asked otherwise; the transport's own complaints are in the node's words.
+const NODE_LOG: &str = "warn,bayesian_object_models=info,rustdds=error,ros2_client=error";
 
 /// Infers the mechanism of an articulated object from segmented point clouds and wrenches.
 #[derive(Debug, Parser)]
@@ -27,13 +34,28 @@ pub struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Command {
     Replay(replay::ReplayArguments),
+    Evaluate(evaluate::EvaluateArguments),
+    Node(node::NodeArguments),
 }
 
 /// Does what was asked.
 pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    start_logging(arguments.log_level.as_deref())?;
     match &arguments.command {
-        Command::Replay(arguments) => replay::run(arguments),
+        Command::Replay(replay) => {
+            start_logging(arguments.log_level.as_deref(), DEFAULT_LOG)?;
+            replay::run(replay)
+        }
+        Command::Node(node) => {
+            let ros = node.parse()?;
+            // ROS has a level that tracing does not: it is the same to it.
+            let level = ros.log_level.as_deref().map(|level| if level == "fatal" { "error" } else { level });
+            start_logging(level.or(arguments.log_level.as_deref()), NODE_LOG)?;
+            node::run(&ros)
+        }
+        Command::Evaluate(evaluate) => {
+            start_logging(arguments.log_level.as_deref(), DEFAULT_LOG)?;
+            evaluate::run(evaluate)
+        }
     }
 }
 
@@ -44,16 +66,29 @@ pub fn complain(error: &anyhow::Error) {
     let _ = writeln!(io::stderr().lock(), "bom: {text}");
 }
 
-fn start_logging(level: Option<&str>) -> anyhow::Result<()> {
+fn start_logging(level: Option<&str>, otherwise: &str) -> anyhow::Result<()> {
     let filter = match level {
+        // A bare level is for this program, not for the transport.
+        Some(level) if level.parse::<tracing::Level>().is_ok() => {
+            EnvFilter::try_new(format!("{level},rustdds=error,ros2_client=error"))?
+        }
         Some(directives) => EnvFilter::try_new(directives).with_context(|| format!("--log-level {directives}"))?,
         None => match std::env::var(EnvFilter::DEFAULT_ENV) {
             Ok(directives) => EnvFilter::try_new(&directives).with_context(|| format!("RUST_LOG={directives}"))?,
-            Err(_) => EnvFilter::new(DEFAULT_LOG),
+            Err(_) => EnvFilter::new(otherwise),
         },
     };
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(progress::AboveTheBar::new).without_time().init();
+    tracing_subscriber::registry()
+        .with(filter)
+        .with(tracing_subscriber::fmt::layer().with_writer(progress::AboveTheBar::new).without_time())
+        .with(RosoutLayer)
+        .init();
     Ok(())
+}
+
+/// What is wrong where a saved model's root is not where the first frame has it.
+fn other_object(model: &str, root: Label) -> String {
+    format!("{model}: another object, or it stands elsewhere: part {root}, its root, is not where the model has it")
 }
 
 /// Prints to standard output; a reader that has gone away is no failure.

@@ -17,8 +17,10 @@ pub use selection::{Component, Selection, Selector};
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use serde::{Deserialize, Serialize};
+
 use crate::inference::Failure;
-use crate::model::{DynamicsInput, DynamicsLearner, KinematicFit};
+use crate::model::{BatchWindow, DynamicsInput, DynamicsLearner, KinematicFit};
 use crate::types::Label;
 use crate::types::posterior::{Criticism, Verdict};
 use rest::RestReadings;
@@ -30,13 +32,15 @@ const MOST_WINDOWS: usize = 8;
 const SENSOR_SCALES: [f64; 3] = [1.0, 0.2, 0.05];
 
 /// Follows a learner and says what it lacks.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Critic {
     /// The last selection.
+    #[serde(skip)]
     pub selection: Option<Selection>,
     findings: Option<Criticism>,
     adopted: bool,
     /// The joints that the last selection's numbers are about, and the numbers.
+    #[serde(skip)]
     known: Option<(Vec<Label>, Numbers)>,
 }
 
@@ -70,7 +74,7 @@ impl Critic {
         let known_joints = known.is_some();
         let added = known.map_or_else(BTreeMap::new, |(_, numbers)| numbers.added.clone());
         let numbers = Numbers { joints, sensor, added };
-        let (selected, findings) = {
+        let (selected, findings, scales) = {
             let workshop =
                 Workshop { learner, fit, input, rest_prior: rest_prior.clone(), sensor_scales: SENSOR_SCALES, spans };
             let found =
@@ -80,10 +84,25 @@ impl Critic {
             tracing::debug!(evidence = base.log_evidence, additions = ?base.additions, kappa = ?noise_scales(&base, &batch), "base");
             let before = scores(&workshop, &batch, &base).unwrap_or_default();
             let selected = selector.select(base.clone())?;
+            // A window that no hypothesis comes near, while the others are explained, is none of the physics'.
+            let outlying = outlying(&selected);
+            let rest_of_batch: Vec<BatchWindow> =
+                batch.iter().enumerate().filter(|(w, _)| !outlying.contains(w)).map(|(_, window)| window.clone()).collect();
+            let batch = &rest_of_batch[..];
+            let selector = Selector { batch, ..selector };
+            let (base, before, selected) = if outlying.is_empty() {
+                (base, before, selected)
+            } else {
+                tracing::debug!(?outlying, "windows left out");
+                let base_additions = base.additions.clone();
+                let base = selector.fitted(&base_additions, &base.numbers, (6, 1))?;
+                let before = scores(&workshop, batch, &base).unwrap_or_default();
+                (base.clone(), before, selector.select(base)?)
+            };
             let mut selected = selector.describe_leftover(selected)?;
             let mut after = before.clone();
             if !selected.rivals.is_empty() {
-                match scores(&workshop, &batch, &selected) {
+                match scores(&workshop, batch, &selected) {
                     // What does not predict windows not yet learned better is not there.
                     Ok(found) if found.windows == 0 || found.log_predictive_density > before.log_predictive_density => {
                         after = found;
@@ -92,7 +111,7 @@ impl Critic {
                 }
             }
             tracing::debug!(evidence = selected.log_evidence, steps = selected.steps, additions = ?selected.additions,
-                kappa = ?noise_scales(&selected, &batch), before = before.log_predictive_density, after = after.log_predictive_density, "selected");
+                kappa = ?noise_scales(&selected, batch), before = before.log_predictive_density, after = after.log_predictive_density, "selected");
             // What weighs most decides: a name beside a stronger unknown explains little.
             let loss = |addition: &Addition| {
                 let rivals = selected.rivals.get(addition)?;
@@ -107,13 +126,13 @@ impl Critic {
                 () => Verdict::Adequate,
             };
             let findings = Criticism { verdict, effects: Vec::new(), before: before.rows, after: after.rows };
-            (selected, findings)
+            let scales = noise_scales(&selected, batch);
+            (selected, findings, scales)
         };
         let found = findings.verdict != Verdict::Insufficient && !selected.rivals.is_empty();
         let mut findings = findings;
         if found || self.adopted {
             let additions = if found { selected.additions.clone() } else { BTreeSet::new() };
-            let scales = noise_scales(&selected, &batch);
             let spans = input.windows.iter().filter_map(|w| Some([*w.times_s.first()?, *w.times_s.last()?])).collect();
             let hypothesis =
                 Workshop { learner, fit, input, rest_prior: rest_prior.clone(), sensor_scales: SENSOR_SCALES, spans }
@@ -135,7 +154,7 @@ impl Critic {
 }
 
 /// κ by window.
-fn noise_scales(selection: &Selection, batch: &[crate::model::BatchWindow]) -> Vec<(usize, f64)> {
+fn noise_scales(selection: &Selection, batch: &[BatchWindow]) -> Vec<(usize, f64)> {
     let mut scales: Vec<(usize, f64)> = Vec::new();
     for component in &selection.components {
         if let Some(fitted) = &component.fitted {
@@ -145,4 +164,20 @@ fn noise_scales(selection: &Selection, batch: &[crate::model::BatchWindow]) -> V
     }
     scales.sort_by_key(|(index, _)| *index);
     scales
+}
+
+/// κ of a window that a model does not come near.
+const OUTLYING: f64 = 1e4;
+
+/// Places in the batch of the windows that the selected model does not come near, where most are explained.
+fn outlying(selection: &Selection) -> Vec<usize> {
+    let mut far = Vec::new();
+    let mut all = 0;
+    for component in &selection.components {
+        let Some(fitted) = &component.fitted else { continue };
+        all += component.windows.len();
+        let own = component.windows.iter().zip(&fitted.windows);
+        far.extend(own.filter(|(_, window)| window.noise_scale >= OUTLYING).map(|(w, _)| *w));
+    }
+    if 3 * far.len() <= all { far } else { Vec::new() }
 }

@@ -88,8 +88,15 @@ impl Workshop<'_> {
                 Addition::Stop(joint, upper) => mechanism.joints[joint].stops[usize::from(upper)] = true,
                 Addition::Friction(joint) => mechanism.joints[joint].friction = true,
                 Addition::Effect(joint, kind) => {
-                    let mut effect = self.learner.effect_on(joint, kind, self.fit).ok_or(Failure::NoInformation)?;
-                    effect.scales.duration_s = self.duration_s();
+                    // What is in the learner's model keeps its scales, and so its numbers their meaning.
+                    let declared = mechanism.joints[joint].effects.len();
+                    let adopted = &self.learner.mechanism().joints[joint].effects;
+                    let adopted = adopted.iter().skip(declared).find(|effect| effect.kind == kind).copied();
+                    let mut effect =
+                        adopted.or_else(|| self.learner.effect_on(joint, kind, self.fit)).ok_or(Failure::NoInformation)?;
+                    if adopted.is_none() {
+                        effect.scales.duration_s = self.duration_s();
+                    }
                     mechanism.joints[joint].effects.push(effect);
                 }
                 Addition::Table(joint, kind) => {
@@ -145,7 +152,7 @@ impl Workshop<'_> {
             TableKind::ClosingDamping => 0.3 * scales.force / scales.rate,
             _ => 0.3 * scales.force,
         };
-        AddedTable { kind, nodes: nodes.into(), scale, correlation, reversed: scales.travel < 0.0 }
+        AddedTable { kind, nodes, scale, correlation, reversed: scales.travel < 0.0 }
     }
 
     /// The least and the greatest position of a joint \[m or rad\].

@@ -30,6 +30,9 @@ const TABLES_TRIED: usize = 4;
 const KNOWN: f64 = 1e9;
 /// A delay is tried from these \[scales\]: the motion's dependence on it is far from linear.
 const DELAYS: [f64; 4] = [-0.8, 0.3, 1.0, 2.0];
+/// A review ends at this many linearizations of a window; one in which several joints move counts for
+/// the square of their number and as much again.
+const BUDGET: usize = 1500;
 /// Linearizations of a refit, and how often κ is chosen anew.
 const REFIT: (usize, usize) = (8, 2);
 
@@ -110,6 +113,19 @@ struct Trial {
 }
 
 impl Selector<'_> {
+    /// What a linearization of these windows costs, in those of windows of one joint.
+    fn weight(&self, windows: &[usize]) -> usize {
+        let one = |w: &usize| match self.batch[*w].moving.len() {
+            1 => 1,
+            several => 2 * several * several,
+        };
+        windows.iter().map(one).sum()
+    }
+
+    fn cost(&self, trial: &Trial) -> usize {
+        trial.fits.iter().map(|(windows, fitted)| fitted.steps * self.weight(windows)).sum()
+    }
+
     fn windows(&self, places: &[usize]) -> Vec<&BatchWindow> {
         places.iter().map(|&w| &self.batch[w]).collect()
     }
@@ -139,7 +155,7 @@ impl Selector<'_> {
             let fitted = hypothesis.fit(&windows, &x, &scales, effort)?;
             selection.numbers.take(&hypothesis, additions, &fitted.x, &component.joints);
             selection.log_evidence += fitted.log_evidence;
-            selection.steps += fitted.steps;
+            selection.steps += fitted.steps * self.weight(&component.windows);
             component.fitted = Some(fitted);
         }
         Ok(selection)
@@ -184,7 +200,7 @@ impl Selector<'_> {
                     let (low, high) = self.workshop.range(joint);
                     let start = vec![if upper { high } else { low }];
                     if let Ok(trial) = self.trial(&current, &Ranked { addition: stop, gain: 0.0, start }, (5, 1)) {
-                        current.steps += trial.fits.iter().map(|(_, f)| f.steps).sum::<usize>();
+                        current.steps += self.cost(&trial);
                         if trial.gain > STOP_GAIN {
                             self.take(&mut current, &trial);
                         }
@@ -205,8 +221,11 @@ impl Selector<'_> {
             let candidates = ranked.len().max(1) as f64;
             let mut trials: Vec<Trial> = Vec::new();
             for candidate in self.shortlist(&ranked) {
+                if current.steps > BUDGET {
+                    break;
+                }
                 if let Ok(trial) = self.best_trial(&current, &candidate) {
-                    current.steps += trial.fits.iter().map(|(_, f)| f.steps).sum::<usize>();
+                    current.steps += self.cost(&trial);
                     tracing::debug!(addition = ?trial.addition, first_order = candidate.gain, gain = trial.gain, "trial");
                     trials.push(trial);
                 }
@@ -513,13 +532,13 @@ impl Selector<'_> {
             let Some(joint) = addition.joint() else { continue };
             // Where κ is large nothing gains much at first order.
             let count = tried.entry(joint).or_default();
-            if *count >= TABLES_TRIED || (gain < LEAST_TABLE_GAIN && !misfits(&current, joint)) {
+            if current.steps > BUDGET || *count >= TABLES_TRIED || (gain < LEAST_TABLE_GAIN && !misfits(&current, joint)) {
                 continue;
             }
             *count += 1;
             let trial = self.trial(&current, &Ranked { addition, gain, start: Vec::new() }, REFIT);
             let Ok(trial) = trial else { continue };
-            current.steps += trial.fits.iter().map(|(_, f)| f.steps).sum::<usize>();
+            current.steps += self.cost(&trial);
             tracing::debug!(?addition, gain, refitted = trial.gain, "table");
             if trial.gain > LEAST_TABLE_GAIN && best.get(&joint).is_none_or(|(other, _)| trial.gain > *other) {
                 best.insert(joint, (trial.gain, trial));

@@ -59,7 +59,7 @@ pub fn probes(
     for (kind, nodes, scale) in plans {
         let table = AddedTable {
             kind,
-            nodes: nodes.into(),
+            nodes,
             scale: scale * force,
             correlation: 1.0,
             reversed: scales.travel < 0.0,
@@ -131,7 +131,7 @@ pub fn probes(
     for t in own..model_of.tables.len() {
         let first = mechanism.offset(joint) + model_of.table_offset(t);
         let place = extra.iter().position(|&i| i == first).ok_or(Failure::NoInformation)?;
-        tables.push((model_of.tables[t].kind, model_of.tables[t].nodes.to_vec(), place));
+        tables.push((model_of.tables[t].kind, model_of.tables[t].nodes.clone(), place));
     }
     let of_tables = added;
     let of_sensor: Vec<usize> = (of_tables..extra.len()).collect();

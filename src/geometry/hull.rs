@@ -4,6 +4,7 @@
 //! width, not a measurement.
 
 use nalgebra::{Matrix3, Vector3};
+use serde::{Deserialize, Serialize};
 use parry3d_f64::mass_properties::MassProperties;
 use parry3d_f64::transformation::try_convex_hull;
 
@@ -12,7 +13,7 @@ use parry3d_f64::transformation::try_convex_hull;
 const PLATE_THICKNESS: f64 = 0.018;
 
 /// Mass properties at unit density, uniform, of a part's convex hull.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct HullProperties {
     /// Volume \[m³\].
     pub volume: f64,

@@ -7,12 +7,14 @@
 use std::collections::BTreeMap;
 
 use nalgebra::{DMatrix, DVector};
+use serde::{Deserialize, Serialize};
 
 use super::gaussian::Gaussian;
 use super::solver::Failure;
+use crate::types::pairs;
 
 /// A Gaussian factor of some blocks, in their order.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Factor<N> {
     /// The blocks with their lengths.
     pub blocks: Vec<(N, usize)>,
@@ -21,9 +23,15 @@ pub struct Factor<N> {
 }
 
 /// Prior factors and sites.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(bound(
+    serialize = "N: Serialize, S: Serialize",
+    deserialize = "N: Deserialize<'de>, S: Deserialize<'de>"
+))]
 pub struct Belief<N: Ord + Clone, S: Ord> {
+    #[serde(with = "pairs")]
     priors: BTreeMap<N, Factor<N>>,
+    #[serde(with = "pairs")]
     sites: BTreeMap<S, Factor<N>>,
 }
 
@@ -89,6 +97,24 @@ impl<N: Ord + Clone, S: Ord> Belief<N, S> {
         self.sites.insert(site, factor);
     }
 
+    /// Takes a site out.
+    pub fn remove(&mut self, site: &S) -> Option<Factor<N>> {
+        self.sites.remove(site)
+    }
+
+    /// Multiplies a factor onto a site: what was two observations is one from now on.
+    pub fn multiply(&mut self, site: S, factor: &Factor<N>) {
+        let old = self.sites.remove(&site);
+        let joint = product(old.iter().chain([factor]));
+        let blocks = joint.places.iter().map(|(name, (_, length))| (name.clone(), *length)).collect();
+        self.sites.insert(site, Factor { blocks, gaussian: joint.gaussian });
+    }
+
+    /// Gives the sites other names.
+    pub fn rename_sites(&mut self, name: impl Fn(S) -> S) {
+        self.sites = std::mem::take(&mut self.sites).into_iter().map(|(site, factor)| (name(site), factor)).collect();
+    }
+
     /// Drops the sites that mention a block; says which.
     pub fn drop_sites_of(&mut self, block: &N) -> Vec<S> {
         let sites = std::mem::take(&mut self.sites);
@@ -105,22 +131,28 @@ impl<N: Ord + Clone, S: Ord> Belief<N, S> {
             .values()
             .chain(self.sites.iter().filter(|(name, _)| Some(*name) != without).map(|(_, f)| f))
             .collect();
-        let mut places: BTreeMap<N, (usize, usize)> = BTreeMap::new();
-        for (name, length) in factors.iter().flat_map(|f| &f.blocks) {
-            places.insert(name.clone(), (0, *length));
-        }
-        let mut total = 0;
-        for (start, length) in places.values_mut() {
-            *start = total;
-            total += *length;
-        }
-        let mut joint = Joint { places, gaussian: Gaussian::flat(total) };
-        for factor in factors {
-            let at: Vec<usize> = factor.blocks.iter().flat_map(|(name, _)| joint.places(name)).collect();
-            joint.gaussian.multiply_at(&factor.gaussian, &at);
-        }
-        joint
+        product(factors)
     }
+}
+
+/// The product of factors, over all their blocks.
+fn product<'a, N: Ord + Clone + 'a>(factors: impl IntoIterator<Item = &'a Factor<N>>) -> Joint<N> {
+    let factors: Vec<&Factor<N>> = factors.into_iter().collect();
+    let mut places: BTreeMap<N, (usize, usize)> = BTreeMap::new();
+    for (name, length) in factors.iter().flat_map(|f| &f.blocks) {
+        places.insert(name.clone(), (0, *length));
+    }
+    let mut total = 0;
+    for (start, length) in places.values_mut() {
+        *start = total;
+        total += *length;
+    }
+    let mut joint = Joint { places, gaussian: Gaussian::flat(total) };
+    for factor in factors {
+        let at: Vec<usize> = factor.blocks.iter().flat_map(|(name, _)| joint.places(name)).collect();
+        joint.gaussian.multiply_at(&factor.gaussian, &at);
+    }
+    joint
 }
 
 #[cfg(test)]
@@ -156,6 +188,24 @@ mod tests {
         }
         let (_, after) = belief.product(None).moments(&["x"]).expect("proper");
         assert!((before[(0, 0)] - after[(0, 0)]).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_multiplied_site_says_what_its_parts_said() {
+        let mut belief = Belief::default();
+        belief.set_prior("x", factor(0.0, 1.0));
+        belief.replace(0, factor(3.0, 0.1));
+        belief.replace(1, Factor { blocks: vec![("y", 1)], ..factor(-1.0, 0.3) });
+        belief.set_prior("y", Factor { blocks: vec![("y", 1)], ..factor(0.0, 2.0) });
+        let before = belief.product(None).moments(&["x", "y"]).expect("proper");
+        for site in [0, 1] {
+            let taken = belief.remove(&site).expect("a site");
+            belief.multiply(7, &taken);
+        }
+        belief.rename_sites(|site| site + 1);
+        assert!(belief.site(&0).is_none() && belief.site(&8).is_some_and(|f| f.blocks.len() == 2));
+        let after = belief.product(None).moments(&["x", "y"]).expect("proper");
+        assert!((before.0 - after.0).norm() < 1e-12 && (before.1 - after.1).norm() < 1e-12);
     }
 
     #[test]

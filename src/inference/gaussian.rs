@@ -1,11 +1,12 @@
 //! Gaussians in information form: products and quotients are sums and differences.
 
 use nalgebra::{DMatrix, DVector};
+use serde::{Deserialize, Serialize};
 
 use super::solver::Failure;
 
 /// exp(−½ xᵀ Λ x + hᵀ x): a density if Λ is positive definite, else only a factor of one.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Gaussian {
     /// Λ.
     pub precision: DMatrix<f64>,

@@ -4,12 +4,13 @@
 //! ½ |r(x)|² + ½ (x − m)ᵀ Λ (x − m). The Laplace log evidence is −cost − ½ ln |H| + ½ ln |Λ|.
 
 use nalgebra::{DMatrix, DVector};
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::gaussian::Gaussian;
 
 /// Why an inference gave no result.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Error, Serialize, Deserialize)]
 pub enum Failure {
     /// The model gives no finite prediction here.
     #[error("the model diverges")]

@@ -51,6 +51,8 @@ pub struct Config {
     pub input: InputConfig,
     /// A posterior counts from its window's close plus this, in stamp time \[s\].
     pub posterior_latency_s: f64,
+    /// `bom evaluate` simulates this far from what was seen \[s\].
+    pub evaluation_horizon_s: f64,
     /// When interaction windows open and close.
     pub windows: WindowSettings,
     /// What counts as an observation.
@@ -68,6 +70,7 @@ impl Default for Config {
             gravity_m_s2: [0.0, 0.0, -9.81],
             input: InputConfig::default(),
             posterior_latency_s: 0.0,
+            evaluation_horizon_s: 1.0,
             windows: WindowSettings::default(),
             observations: ObservationConfig::default(),
             kinematics: KinematicSettings::default(),
@@ -88,6 +91,7 @@ impl Config {
             declared: self.model.clone(),
             predict: false,
             posterior_latency_s: self.posterior_latency_s,
+            live: false,
         }
     }
 
@@ -130,6 +134,7 @@ impl Config {
         let positive = [
             ("windows.force_threshold_n", self.windows.force_threshold_n),
             ("windows.smoothing_s", self.windows.smoothing_s),
+            ("evaluation_horizon_s", self.evaluation_horizon_s),
             ("windows.quiet_s", self.windows.quiet_s),
             ("windows.longest_s", self.windows.longest_s),
             ("kinematics.tool_offset_sigma", self.kinematics.tool_offset_sigma),
@@ -137,6 +142,7 @@ impl Config {
             ("kinematics.shared_distance", self.kinematics.shared_distance),
             ("kinematics.rest_deviations", self.kinematics.rest_deviations),
             ("kinematics.student_freedom", self.kinematics.student_freedom),
+            ("windows.kept", self.windows.kept as f64),
             ("kinematics.steps", self.kinematics.steps as f64),
         ];
         positive.into_iter().try_for_each(|(key, value)| positive_number(key, value))?;

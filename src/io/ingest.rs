@@ -13,11 +13,14 @@ use super::{
     cdr,
     config::InputConfig,
     counters::{ByReason, Counters, Diagnostic},
-    messages::{Header, PointCloud2, PoseWithCovarianceStamped, TfMessage, WrenchStamped},
+    messages::{
+        Header, POINT_CLOUD_TYPE, POSE_TYPE, PointCloud2, PoseWithCovarianceStamped, TF_TYPE, TfMessage, WRENCH_TYPE,
+        WrenchStamped,
+    },
     point_cloud,
     resolve::{Content, Rejection, WaitingMessage},
     topics::Role,
-    transforms::{TransformBuffer, bare},
+    transforms::{LookupError, TransformBuffer, bare},
 };
 use crate::types::{Input, Stamp};
 
@@ -58,6 +61,11 @@ impl Ingest {
         }
     }
 
+    /// Nothing read yet, by another configuration, but for the transforms that are known.
+    pub fn anew(&self, config: &InputConfig) -> Self {
+        Self { transforms: self.transforms.clone(), ..Self::new(config) }
+    }
+
     /// What was counted so far.
     pub fn counters(&self) -> &Counters {
         &self.counters
@@ -80,23 +88,61 @@ impl Ingest {
         let Some(role) = self.role(topic) else {
             return Vec::new();
         };
-        if type_name != role.type_name() {
-            let reason = format!("type {type_name}, expected {}", role.type_name());
-            self.count_arrival(role);
-            self.reject(topic, role, Rejection::new(None, "wrong_type", reason));
+        let decoded = match type_name == role.type_name() {
+            true => Message::decode(role, message),
+            false => Err(wrong_type(type_name, role)),
+        };
+        self.take(topic, role, decoded);
+        self.release(false)
+    }
+
+    /// The same for a message that is decoded already.
+    pub fn push_message(&mut self, topic: &str, message: Message<'_>) -> Vec<Input> {
+        let Some(role) = self.role(topic) else {
             return Vec::new();
+        };
+        self.take(topic, role, Ok(message));
+        self.release(false)
+    }
+
+    /// Another stream begins, as when a clock jumps back: what waits is dropped, moving transforms are
+    /// forgotten, fixed ones and counts are kept.
+    pub fn begin_again(&mut self) -> Vec<Input> {
+        let inputs = self.release(true);
+        self.topics.values_mut().for_each(|topic| topic.newest_in_frame.clear());
+        self.transforms.forget_moving();
+        self.newest = None;
+        inputs
+    }
+
+    /// The messages that wait for a transform: of each topic the first one's frame and what is missing.
+    pub fn waiting(&self) -> Vec<(String, LookupError)> {
+        let first = |(name, topic): (&String, &Topic)| {
+            let waiting = topic.waiting.front()?;
+            let looked_up = self.transforms.lookup(&self.config.fixed_frame, &waiting.frame, waiting.stamp);
+            Some((name.clone(), looked_up.err()?))
+        };
+        self.topics.iter().filter_map(first).collect()
+    }
+
+    fn take(&mut self, topic: &str, role: Role, decoded: Result<Message<'_>, Rejection>) {
+        let tf = matches!(role, Role::Tf | Role::TfStatic);
+        if !tf {
+            self.count_arrival(role);
         }
-        match role {
-            Role::Tf | Role::TfStatic => self.take_transforms(topic, role, message),
-            Role::Cloud | Role::Wrench(_) | Role::Pose(_) => {
-                self.count_arrival(role);
-                match self.read(topic, role, message) {
-                    Ok(waiting) => self.enqueue(topic, role, waiting),
-                    Err(rejection) => self.reject(topic, role, rejection),
+        match decoded {
+            Ok(Message::Tf(message)) if tf => self.take_transforms(topic, role, &message),
+            Ok(message) => match self.read(topic, role, &message) {
+                Ok(waiting) => self.enqueue(topic, role, waiting),
+                Err(rejection) => self.reject(topic, role, rejection),
+            },
+            Err(rejection) => {
+                if tf {
+                    self.count_arrival(role);
                 }
+                self.reject(topic, role, rejection);
             }
         }
-        self.release(false)
     }
 
     /// The end of the stream: no further transform will come, so that what still waits is dropped.
@@ -114,14 +160,13 @@ impl Ingest {
         role
     }
 
-    /// Decodes and checks one message, all but its place in world.
-    fn read(&mut self, topic: &str, role: Role, message: &[u8]) -> Result<WaitingMessage, Rejection> {
-        match role {
-            Role::Cloud => {
-                let cloud: PointCloud2 = decode(message)?;
+    /// Checks one message, all but its place in world.
+    fn read(&mut self, topic: &str, role: Role, message: &Message<'_>) -> Result<WaitingMessage, Rejection> {
+        match (role, message) {
+            (Role::Cloud, Message::Cloud(cloud)) => {
                 let stamp = checked_stamp(&cloud.header)?;
                 let (points, dropped) =
-                    point_cloud::read_points(&cloud, &self.config.label_field, &self.config.ignored_labels).map_err(
+                    point_cloud::read_points(cloud, &self.config.label_field, &self.config.ignored_labels).map_err(
                         |error| {
                             if let point_cloud::PointCloudError::NoUsablePoint { dropped, .. } = &error {
                                 count_points(&mut self.counters.points_dropped, dropped);
@@ -131,23 +176,22 @@ impl Ingest {
                     )?;
                 count_points(&mut self.counters.points_dropped, &dropped);
                 self.counters.points_in += points.len() as u64;
+                let frame = cloud.header.frame_id.clone();
                 let next = self.sources.len();
-                let source = *self.sources.entry((topic.to_owned(), cloud.header.frame_id.clone())).or_insert(next);
-                Ok(WaitingMessage { stamp, frame: cloud.header.frame_id, content: Content::Cloud { source, points } })
+                let source = *self.sources.entry((topic.to_owned(), frame.clone())).or_insert(next);
+                Ok(WaitingMessage { stamp, frame, content: Content::Cloud { source, points } })
             }
-            Role::Wrench(source) => {
-                let message: WrenchStamped = decode(message)?;
+            (Role::Wrench(source), Message::Wrench(message)) => {
                 let stamp = checked_stamp(&message.header)?;
                 let content = Content::wrench(&message.wrench, source, &self.config, stamp)?;
-                Ok(WaitingMessage { stamp, frame: message.header.frame_id, content })
+                Ok(WaitingMessage { stamp, frame: message.header.frame_id.clone(), content })
             }
-            Role::Pose(label) => {
-                let message: PoseWithCovarianceStamped = decode(message)?;
+            (Role::Pose(label), Message::Pose(message)) => {
                 let stamp = checked_stamp(&message.header)?;
                 let content = Content::pose(&message.pose, label, &self.config, stamp)?;
-                Ok(WaitingMessage { stamp, frame: message.header.frame_id, content })
+                Ok(WaitingMessage { stamp, frame: message.header.frame_id.clone(), content })
             }
-            Role::Tf | Role::TfStatic => Err(Rejection::new(None, "wrong_type", "transforms do not wait".into())),
+            (role, message) => Err(wrong_type(message.type_name(), role)),
         }
     }
 
@@ -172,14 +216,7 @@ impl Ingest {
         state.waiting.push_back(waiting);
     }
 
-    fn take_transforms(&mut self, topic: &str, role: Role, message: &[u8]) {
-        let message: TfMessage = match decode(message) {
-            Ok(message) => message,
-            Err(rejection) => {
-                self.counters.tf_in += 1;
-                return self.reject(topic, role, rejection);
-            }
-        };
+    fn take_transforms(&mut self, topic: &str, role: Role, message: &TfMessage) {
         for transform in &message.transforms {
             self.counters.tf_in += 1;
             let taken = checked_stamp(&transform.header).and_then(|stamp| {
@@ -257,6 +294,44 @@ impl Ingest {
             self.diagnostics.push(diagnostic);
         }
     }
+}
+
+/// A message of one of the types that are read.
+#[derive(Clone, Debug)]
+pub enum Message<'a> {
+    /// Segmented points.
+    Cloud(PointCloud2<'a>),
+    /// A wrench reading.
+    Wrench(WrenchStamped),
+    /// A part's pose.
+    Pose(Box<PoseWithCovarianceStamped>),
+    /// Transforms.
+    Tf(TfMessage),
+}
+
+impl<'a> Message<'a> {
+    fn decode(role: Role, message: &'a [u8]) -> Result<Self, Rejection> {
+        Ok(match role {
+            Role::Cloud => Self::Cloud(decode(message)?),
+            Role::Wrench(_) => Self::Wrench(decode(message)?),
+            Role::Pose(_) => Self::Pose(Box::new(decode(message)?)),
+            Role::Tf | Role::TfStatic => Self::Tf(decode(message)?),
+        })
+    }
+
+    /// Its type, as `package/msg/Name`.
+    pub fn type_name(&self) -> &'static str {
+        match self {
+            Self::Cloud(_) => POINT_CLOUD_TYPE,
+            Self::Wrench(_) => WRENCH_TYPE,
+            Self::Pose(_) => POSE_TYPE,
+            Self::Tf(_) => TF_TYPE,
+        }
+    }
+}
+
+fn wrong_type(type_name: &str, role: Role) -> Rejection {
+    Rejection::new(None, "wrong_type", format!("type {type_name}, expected {}", role.type_name()))
 }
 
 fn decode<'de, T: Deserialize<'de>>(message: &'de [u8]) -> Result<T, Rejection> {

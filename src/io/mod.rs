@@ -12,6 +12,7 @@ pub mod definitions;
 pub mod document;
 pub mod ingest;
 pub mod messages;
+pub mod model_file;
 pub mod output_file;
 pub mod point_cloud;
 mod point_field;

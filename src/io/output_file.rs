@@ -46,6 +46,11 @@ impl OutputFile {
         Ok(Self { path: path.to_owned(), target: target.map_err(fail)? })
     }
 
+    /// Where it will be.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
     /// Completes it.
     ///
     /// # Errors

@@ -203,6 +203,11 @@ impl TransformBuffer {
         Ok(())
     }
 
+    /// Drops all links that move, as when their clock starts anew.
+    pub fn forget_moving(&mut self) {
+        self.links.retain(|_, link| matches!(link.motion, Motion::Static(_)));
+    }
+
     /// `fixed_from_frame` at a stamp: carries points of `frame` into `fixed_frame`. The identity
     /// if both are the same.
     ///

@@ -6,6 +6,7 @@
 use std::ops::Mul;
 
 use nalgebra::{Matrix3, Matrix6, Rotation3, UnitQuaternion, Vector3, Vector6};
+use serde::{Deserialize, Serialize};
 
 use super::Real;
 
@@ -24,7 +25,8 @@ pub fn orthonormal_pair(axis: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
 }
 
 /// A rigid transform x ↦ R x + t.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(bound(serialize = "T: Serialize", deserialize = "T: Deserialize<'de>"))]
 pub struct Pose<T: Real = f64> {
     /// R, a rotation matrix.
     pub rotation: Matrix3<T>,

@@ -170,6 +170,11 @@ impl<T: Real> Tree<T> {
         &self.bodies
     }
 
+    /// What the joint of a body does by itself, to change it.
+    pub fn parameters_mut(&mut self, body: usize) -> &mut JointParameters<T> {
+        &mut self.bodies[body].parameters
+    }
+
     /// How many bodies there are: the length of every slice of positions or rates.
     pub fn body_count(&self) -> usize {
         self.bodies.len()

@@ -9,6 +9,7 @@
 use std::collections::BTreeMap;
 
 use nalgebra::Vector3;
+use serde::{Deserialize, Serialize};
 
 use super::kinematics::{Axis, KinematicJoint, KinematicSettings, fit_kinematics};
 use super::window::{Contact, PoseMeasurement, WindowObservations};
@@ -38,7 +39,7 @@ pub struct EdgePart {
 }
 
 /// One joint type of one edge.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct EdgeFit {
     /// Log evidence, tempered \[nats\].
     pub log_evidence: f64,
@@ -46,6 +47,8 @@ pub struct EdgeFit {
     pub joint: KinematicJoint,
     /// Joint positions by window and frame.
     pub positions: Vec<Vec<f64>>,
+    /// What each window adds to the evidence \[nats\].
+    pub by_window: Vec<f64>,
 }
 
 /// The windows seen from a parent that moves along `track` (by window and frame).
@@ -96,8 +99,12 @@ pub fn relative_windows(
         .collect()
 }
 
-/// Evidence of no motion at all relative to the parent.
-pub fn rigid_evidence(part: &EdgePart, windows: &[WindowObservations], settings: &KinematicSettings) -> f64 {
+/// Evidence of no motion at all relative to the parent \[nats\], and what each window adds to it.
+pub fn rigid_evidence(
+    part: &EdgePart,
+    windows: &[WindowObservations],
+    settings: &KinematicSettings,
+) -> (f64, Vec<f64>) {
     let still = KinematicJoint {
         parent: None,
         child: part.label,
@@ -110,7 +117,8 @@ pub fn rigid_evidence(part: &EdgePart, windows: &[WindowObservations], settings:
     let references: Vec<&WindowObservations> = windows.iter().collect();
     let positions = windows.iter().map(|w| vec![vec![0.0; w.times_s.len()]]).collect();
     let frozen = KinematicSettings { steps: 2, ..*settings };
-    -TEMPERATURE * fit_kinematics(vec![still], positions, &references, &frozen).cost
+    let fit = fit_kinematics(vec![still], positions, &references, &frozen);
+    (-TEMPERATURE * fit.cost, fit.window_costs.iter().map(|cost| -TEMPERATURE * cost).collect())
 }
 
 /// Fits one moving type from each start axis and keeps the best; `resting`: the windows in which the
@@ -147,9 +155,12 @@ pub fn moving_evidence(
                 .map(|i| 0.5 * fit.covariance[(i, i)].max(1e-16).ln() - priors[i].ln())
                 .map(|x: f64| x.min(0.0))
                 .sum();
-            let log_evidence = -TEMPERATURE * fit.cost - MOVE_COST * TEMPERATURE * fit.moves[0] as f64 + volume;
+            let move_cost = |moves: usize| MOVE_COST * TEMPERATURE * moves as f64;
+            let log_evidence = -TEMPERATURE * fit.cost - move_cost(fit.moves[0].iter().sum()) + volume;
+            let by_window = fit.window_costs.iter().zip(&fit.moves[0]);
             EdgeFit {
                 log_evidence,
+                by_window: by_window.map(|(cost, moves)| -TEMPERATURE * cost - move_cost(*moves)).collect(),
                 joint: fit.joints[0],
                 positions: fit.positions.into_iter().map(|mut w| w.swap_remove(0)).collect(),
             }
@@ -229,7 +240,8 @@ fn start_positions(joint: &KinematicJoint, window: &WindowObservations, rests: b
     positions
 }
 
-fn nearest_position(joint: &KinematicJoint, screw: &Screw, measured: &PoseMeasurement, start: f64) -> f64 {
+/// The joint position whose displacement is nearest a measured one, from `start`.
+pub fn nearest_position(joint: &KinematicJoint, screw: &Screw, measured: &PoseMeasurement, start: f64) -> f64 {
     let residual = |q: f64| {
         (Pose::from_translation(-joint.center)
             * measured.displacement.inverse()

@@ -9,6 +9,7 @@
 //! eliminated, so the cost is linear in the number of windows.
 
 use std::collections::BTreeMap;
+use std::f64::consts::PI;
 use std::rc::Rc;
 
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
@@ -40,7 +41,7 @@ const REST_BLOCKS: usize = 6;
 const REST_SCORE: f64 = 40.0;
 
 /// A joint axis in world at the reference configuration.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Axis {
     /// Unit direction.
     pub direction: Vector3<f64>,
@@ -49,7 +50,7 @@ pub struct Axis {
 }
 
 /// One joint of a hypothesis.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct KinematicJoint {
     /// Index of the parent's joint in the list, `None` where the parent never moves.
     pub parent: Option<usize>,
@@ -74,6 +75,21 @@ impl KinematicJoint {
             JointType::Rigid => Screw::rigid(),
             JointType::Prismatic => Screw::prismatic(&self.axis.direction),
             JointType::Revolute => Screw::revolute(&self.axis.direction, &self.axis.point),
+        }
+    }
+
+    /// The position \[m or rad\] at which the joint comes nearest to a displacement of the child
+    /// against its parent; of a hinge's turns, the one nearest to `near`.
+    pub fn position_of(&self, displacement: &Pose, near: f64) -> f64 {
+        let direction = &self.axis.direction;
+        match self.joint_type {
+            JointType::Rigid => 0.0,
+            JointType::Prismatic => direction.dot(&(displacement.transform_point(&self.center) - self.center)),
+            JointType::Revolute => {
+                let rotation = displacement.quaternion();
+                let angle = 2.0 * rotation.imag().dot(direction).atan2(rotation.w);
+                near + (angle - near + PI).rem_euclid(2.0 * PI) - PI
+            }
         }
     }
 
@@ -166,7 +182,7 @@ impl Default for KinematicSettings {
 }
 
 /// The fitted kinematics.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct KinematicFit {
     /// The joints with their fitted axes.
     pub joints: Vec<KinematicJoint>,
@@ -181,8 +197,12 @@ pub struct KinematicFit {
     pub covariance: DMatrix<f64>,
     /// Negative log density at the solution, up to constants of the data.
     pub cost: f64,
-    /// Joint positions that moved from one frame to the next, by joint.
-    pub moves: Vec<usize>,
+    /// Joint positions that moved from one frame to the next, by joint and window.
+    pub moves: Vec<Vec<usize>>,
+    /// What each window adds to the cost, priors apart.
+    pub window_costs: Vec<f64>,
+    /// By how much ln |information| of all that windows share would fall without each.
+    pub window_information: Vec<f64>,
     /// Whether the last step was small.
     pub converged: bool,
 }
@@ -431,22 +451,27 @@ impl<'a> Problem<'a> {
         for joint in self.joints.iter().filter(|j| j.joint_type == JointType::Revolute) {
             cost += 0.5 * (joint.axis.point - joint.center).norm_squared() / joint.axis_point_prior().powi(2);
         }
-        for (w, window) in self.windows.iter().enumerate() {
-            for frame in 0..window.times_s.len() {
-                let displacements = forward(&self.joints, |j| self.positions[w][j][frame]);
-                for (j, displacement) in displacements.iter().enumerate() {
-                    for (_, r, information) in self.residuals(w, j, frame, displacement) {
-                        cost += self.student_cost(r.dot(&(information * r)), 6.0);
-                    }
+        cost + (0..self.windows.len()).map(|w| self.window_cost(w)).sum::<f64>()
+    }
+
+    /// What a window adds to the cost.
+    fn window_cost(&self, w: usize) -> f64 {
+        let window = self.windows[w];
+        let mut cost = 0.0;
+        for frame in 0..window.times_s.len() {
+            let displacements = forward(&self.joints, |j| self.positions[w][j][frame]);
+            for (j, displacement) in displacements.iter().enumerate() {
+                for (_, r, information) in self.residuals(w, j, frame, displacement) {
+                    cost += self.student_cost(r.dot(&(information * r)), 6.0);
                 }
             }
-            for (c, contact) in window.contacts.iter().enumerate() {
-                let Some(&j) = self.by_label.get(&contact.label) else { continue };
-                for (frame, x, sigma) in &contact.track {
-                    let displacements = forward(&self.joints, |i| self.positions[w][i][*frame]);
-                    let e = self.contact_residual(&displacements[j], x, w, c);
-                    cost += self.student_cost(e.norm_squared() / (sigma * sigma), 3.0);
-                }
+        }
+        for (c, contact) in window.contacts.iter().enumerate() {
+            let Some(&j) = self.by_label.get(&contact.label) else { continue };
+            for (frame, x, sigma) in &contact.track {
+                let displacements = forward(&self.joints, |i| self.positions[w][i][*frame]);
+                let e = self.contact_residual(&displacements[j], x, w, c);
+                cost += self.student_cost(e.norm_squared() / (sigma * sigma), 3.0);
             }
         }
         cost
@@ -761,6 +786,7 @@ impl<'a> Problem<'a> {
         let systems = self.linearize();
         let (matrix, _, _) = self.reduced(&systems, 0.0);
         let globals = matrix.nrows();
+        let window_information = window_information(&matrix, &systems);
         let mut covariance = matrix.cholesky().map_or_else(|| DMatrix::identity(globals, globals), |c| c.inverse());
         let mut widening = DVector::repeat(globals, 1.0);
         let mut at = 0;
@@ -777,8 +803,9 @@ impl<'a> Problem<'a> {
             }
         }
         let moves = (0..self.joints.len())
-            .map(|j| self.slots.iter().map(|w| w[j].windows(2).filter(|pair| pair[0] != pair[1]).count()).sum())
+            .map(|j| self.slots.iter().map(|w| w[j].windows(2).filter(|pair| pair[0] != pair[1]).count()).collect())
             .collect();
+        let window_costs = (0..self.windows.len()).map(|w| self.window_cost(w)).collect();
         KinematicFit {
             joints: self.joints,
             positions: self.positions,
@@ -787,6 +814,8 @@ impl<'a> Problem<'a> {
             covariance,
             cost,
             moves,
+            window_costs,
+            window_information,
             converged,
         }
     }
@@ -795,6 +824,22 @@ impl<'a> Problem<'a> {
 struct LocalSolve {
     coupling: DMatrix<f64>,
     gradient: DVector<f64>,
+}
+
+/// By how much ln |matrix| falls without each window's share of it; greatest where nothing else holds.
+fn window_information(matrix: &DMatrix<f64>, systems: &[WindowSystem]) -> Vec<f64> {
+    let log_determinant = |matrix: DMatrix<f64>| {
+        matrix.cholesky().map_or(f64::NEG_INFINITY, |c| 2.0 * c.l_dirty().diagonal().map(f64::ln).sum())
+    };
+    let whole = log_determinant(matrix.clone());
+    systems
+        .iter()
+        .map(|system| {
+            let coupled = system.local.clone().cholesky().map(|c| system.coupling.transpose() * c.solve(&system.coupling));
+            let own = coupled.map_or_else(|| system.global.clone(), |coupled| &system.global - coupled);
+            (whole - log_determinant(matrix - own)).clamp(0.0, f64::MAX)
+        })
+        .collect()
 }
 
 #[derive(Clone, Copy)]

@@ -3,12 +3,13 @@
 use std::collections::BTreeMap;
 
 use nalgebra::{Matrix6, Vector3};
+use serde::{Deserialize, Serialize};
 
 use crate::math::Pose;
 use crate::types::{AppliedWrench, Label};
 
 /// A part's displacement in one frame, as registration measured it.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PoseMeasurement {
     /// D, world frame, since the first frame.
     pub displacement: Pose,
@@ -17,7 +18,7 @@ pub struct PoseMeasurement {
 }
 
 /// The tool holding a part: its origin is a fixed point of the part plus a constant offset.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Contact {
     /// The touched part.
     pub label: Label,
@@ -26,7 +27,7 @@ pub struct Contact {
 }
 
 /// One window's measurements, on the grid of its cloud stamps.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct WindowObservations {
     /// Seconds since time zero of each frame.
     pub times_s: Vec<f64>,

@@ -8,6 +8,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{Matrix6, Vector3, Vector6};
+use serde::{Deserialize, Serialize};
 use rayon::prelude::*;
 
 use crate::math::{Pose, Screw};
@@ -25,6 +26,8 @@ use crate::types::Label;
 const EXPLAINED: f64 = 0.12;
 /// A tool track explained to this root mean square is explained \[m\].
 const TOOL_EXPLAINED: f64 = 0.003;
+/// Excess at which a part that was taken for the root is looked at like the others.
+const LEFT: f64 = 0.6;
 /// Share of the largest eigenvalue of a factor that rough normals may pretend to hold.
 pub const FALSE_SHARE: f64 = 0.01;
 /// A motion may start this far from where the part was, before it costs \[m\].
@@ -44,7 +47,7 @@ pub struct Frame {
 }
 
 /// What a part's scans cost where its pose is known.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct Baseline {
     /// Mean truncated cost per point.
     pub cost: f64,
@@ -53,6 +56,7 @@ pub struct Baseline {
 }
 
 /// What a window's motion is explained with.
+#[derive(Clone, Copy)]
 pub struct Scene<'a> {
     /// The window's frames.
     pub frames: &'a [Frame],
@@ -68,8 +72,8 @@ pub struct Scene<'a> {
     pub joints: &'a [KinematicJoint],
     /// Parts that the tool has moved before: their joints are known from their own motion.
     pub touched_before: &'a BTreeSet<Label>,
-    /// The part that is fixed to the world.
-    pub root: Label,
+    /// The part that is fixed to the world, if that is known.
+    pub root: Option<Label>,
     /// Whether the tool's position is used as an observation.
     pub use_tool: bool,
 }
@@ -91,7 +95,7 @@ pub struct Motion {
 pub fn explain_window(scene: &Scene<'_>) -> BTreeMap<Label, Motion> {
     let mut motions: BTreeMap<Label, Motion> = BTreeMap::new();
     let mut open: Vec<Label> = Vec::new();
-    for &label in scene.models.keys().filter(|&&label| label != scene.root) {
+    for &label in scene.models.keys().filter(|&&label| Some(label) != scene.root) {
         let still = scene.evaluate(label, |_| scene.start_of(label));
         if still.excess < EXPLAINED && scene.tool_miss(label, &still.displacements) < TOOL_EXPLAINED {
             motions.insert(label, still);
@@ -122,6 +126,16 @@ pub fn explain_window(scene: &Scene<'_>) -> BTreeMap<Label, Motion> {
 }
 
 impl Scene<'_> {
+    /// Whether a part cannot have stayed where it was: what comes into view as others move is no sign.
+    pub fn has_left(&self, label: Label) -> bool {
+        if !self.models.contains_key(&label) {
+            return false;
+        }
+        let still = self.evaluate(label, |_| self.start_of(label));
+        tracing::debug!(%label, excess = still.excess, miss = self.tool_miss(label, &still.displacements), "root");
+        still.excess > LEFT || self.tool_miss(label, &still.displacements) > TOOL_EXPLAINED
+    }
+
     fn start_of(&self, label: Label) -> Pose {
         self.start.get(&label).copied().unwrap_or_else(Pose::identity)
     }
@@ -246,7 +260,7 @@ impl Scene<'_> {
     fn parent_track(&self, parent: Option<Label>, known: &BTreeMap<Label, Motion>) -> Option<Vec<Pose>> {
         match parent {
             None => Some(vec![Pose::identity(); self.frames.len()]),
-            Some(label) if label == self.root => Some(vec![Pose::identity(); self.frames.len()]),
+            Some(label) if Some(label) == self.root => Some(vec![Pose::identity(); self.frames.len()]),
             Some(label) => known.get(&label).map(|motion| motion.displacements.clone()),
         }
     }
@@ -277,14 +291,7 @@ impl Scene<'_> {
         contact_point: Option<&Vector3<f64>>,
     ) -> JointPath {
         let model = &self.models[&label];
-        let grid = match joint_type {
-            JointType::Prismatic => (-0.6, 0.6, 0.010),
-            _ => {
-                let reach = axis_distance(screw, &model.centroid) + model.radius;
-                let step = (0.012 / reach).clamp(0.02, 0.08);
-                (-2.2, 2.2, step)
-            }
-        };
+        let grid = grid_of(model, screw, joint_type);
         search_path(model, &self.joint_frames(label, parents), screw, grid, contact_point)
     }
 
@@ -451,6 +458,18 @@ pub fn measurement_of(model: &PartModel, factor: &Quadratic, predicted: &Pose) -
         * Pose::exp(&step)
         * Pose::from_translation(-model.centroid);
     PoseMeasurement { displacement, information }
+}
+
+/// Positions of a joint to look at: least, greatest, step.
+pub fn grid_of(model: &PartModel, screw: &Screw, joint_type: JointType) -> (f64, f64, f64) {
+    match joint_type {
+        JointType::Prismatic => (-0.6, 0.6, 0.010),
+        _ => {
+            let reach = axis_distance(screw, &model.centroid) + model.radius;
+            let step = (0.012 / reach).clamp(0.02, 0.08);
+            (-2.2, 2.2, step)
+        }
+    }
 }
 
 fn seed_type(seed: &AxisSeed) -> JointType {

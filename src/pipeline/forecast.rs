@@ -9,7 +9,7 @@ use std::sync::Arc;
 use nalgebra::{Matrix3, Vector3};
 
 use super::explain::{FEWEST_POINTS, measure, travel};
-use super::{Frame, Learner, Output, nearest_label};
+use super::{Frame, Learner, Output, PipelineSettings, nearest_label};
 use crate::math::Pose;
 use crate::mechanism::WrenchSample;
 use crate::registration::AlignmentSettings;
@@ -51,6 +51,21 @@ struct Waiting {
     displacements: BTreeMap<Label, Pose>,
 }
 
+impl Waiting {
+    /// Starts at `time_s` from the displacements that the parts have then, at rest.
+    fn start_from(&mut self, time_s: f64, displacements: &BTreeMap<Label, Pose>) {
+        self.start_s = time_s;
+        self.displacements.extend(displacements.iter().map(|(label, displacement)| (*label, *displacement)));
+        self.rates.fill(0.0);
+        let Some(mechanism) = &self.mechanism else { return };
+        let seen = |label: Label| displacements.get(&label).copied().unwrap_or_else(Pose::identity);
+        for (joint, position) in mechanism.joints.iter().zip(&mut self.positions) {
+            let parent = joint.parent.map_or_else(Pose::identity, |parent| seen(mechanism.joints[parent].child));
+            *position = joint.position_of(&(parent.inverse() * seen(joint.child)), *position);
+        }
+    }
+}
+
 /// One reading in contact.
 #[derive(Clone, Copy, Debug)]
 struct Touch {
@@ -90,6 +105,7 @@ struct Pending {
 /// From the stream as it comes to predictions.
 pub(super) struct Forecaster {
     latency_s: f64,
+    live: bool,
     use_tool: bool,
     early: Vec<AppliedWrench>,
     zero: Option<Stamp>,
@@ -113,11 +129,12 @@ pub(super) struct Forecaster {
 }
 
 impl Forecaster {
-    /// Nothing seen; a posterior counts from its window's close plus `latency_s`.
-    pub fn new(root: Option<Label>, use_tool: bool, latency_s: f64) -> Self {
+    /// Nothing seen; a posterior counts from its window's close plus the latency.
+    pub fn new(settings: &PipelineSettings) -> Self {
         Self {
-            latency_s,
-            use_tool,
+            latency_s: settings.posterior_latency_s,
+            live: settings.live,
+            use_tool: settings.use_tool,
             early: Vec::new(),
             zero: None,
             samples: Vec::new(),
@@ -134,7 +151,7 @@ impl Forecaster {
             labels: BTreeSet::new(),
             places: BTreeMap::new(),
             pending: VecDeque::new(),
-            root,
+            root: settings.root,
         }
     }
 
@@ -161,8 +178,9 @@ impl Forecaster {
         self.ready(|pending| sample.stamp_s >= pending.time_s + HORIZONS[2])
     }
 
-    /// What a window taught, to count from its close \[s\] plus the latency.
-    pub fn learned(&mut self, learner: &Learner) {
+    /// What a window taught, to count from its close \[s\] plus the latency. Where the stream went
+    /// on meanwhile, `current` is where the parts are by now: the filter starts from there.
+    pub fn learned(&mut self, learner: &Learner, current: Option<&BTreeMap<Label, Pose>>) {
         let (Some(close_s), Some(window)) =
             (learner.windows.last().and_then(|w| w.times_s.last()).copied(), learner.windows.last())
         else {
@@ -184,12 +202,31 @@ impl Forecaster {
             }
         }
         self.root = Some(learner.root);
-        self.waiting.push(Waiting {
+        let mut new = Waiting {
             from_s: close_s + self.latency_s,
             mechanism: mechanism.map(Arc::new),
             start_s: window.times_s[start],
             positions,
             rates,
+            displacements: learner.displacements.clone(),
+        };
+        if let (Some(current), Some(last)) = (current, self.seen.back()) {
+            new.start_from(last.time_s, current);
+        }
+        self.waiting.push(new);
+    }
+
+    /// Starts from a saved object whose joints are at `positions` now.
+    pub fn resumed(&mut self, learner: &Learner, now_s: f64, positions: Vec<f64>) {
+        let noise_scale = learner.inferences.last().map_or(1.0, |inference| inference.noise_scale);
+        let mechanism = learner.fit.as_ref().and_then(|fit| TrackedMechanism::new(fit, &learner.dynamics, noise_scale));
+        self.root = Some(learner.root);
+        self.waiting.push(Waiting {
+            from_s: now_s,
+            mechanism: mechanism.map(Arc::new),
+            start_s: now_s,
+            rates: vec![0.0; positions.len()],
+            positions,
             displacements: learner.displacements.clone(),
         });
     }
@@ -218,6 +255,11 @@ impl Forecaster {
         self.forget(now_s);
         let free = self.free_parts();
         self.pending.push_back(Pending { time_s: now_s, filter: self.filter.clone(), free, root: self.root });
+        if self.live {
+            // The last reading stands for those to come.
+            outputs.extend(self.ready(|_| true));
+            return outputs;
+        }
         let newest_s = self.samples.last().map_or(f64::NEG_INFINITY, |s| s.stamp_s);
         outputs.extend(self.ready(|pending| {
             newest_s >= pending.time_s + HORIZONS[2] || now_s > pending.time_s + HORIZONS[2] + PATIENCE

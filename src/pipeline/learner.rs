@@ -3,8 +3,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{DMatrix, Vector3};
+use serde::{Deserialize, Serialize};
 use rayon::prelude::*;
 
+use super::keyframes::Keyframes;
 use super::explain::{Baseline, Frame, Motion, Scene, explain_window, measure_faces, travel};
 use crate::criticism::Critic;
 use crate::geometry::{HullProperties, hull_properties};
@@ -19,10 +21,11 @@ use crate::registration::{
     AlignmentSettings, PartModel, ScanPoint, Surfel, SurfelAccumulator, fit_circle, fit_line, truncated_cost,
 };
 use crate::structure::TreeDistribution;
-use crate::types::{AppliedWrench, Label};
+use crate::types::posterior::WindowRecord;
+use crate::types::{AppliedWrench, Label, pairs};
 
 /// A part moved if it ever travelled further than this \[m\].
-const MOVED: f64 = 0.006;
+pub(super) const MOVED: f64 = 0.006;
 
 /// A part that stays within this of its place on its parent rests there \[m\].
 const RESTS: f64 = 1e-6;
@@ -34,9 +37,6 @@ const CONTACT_GAP: f64 = 0.03;
 const CONTACT_GAP_SIGMA: f64 = 0.02;
 /// Log prior lost at most by parts that are far apart \[nats\].
 const FARTHEST_PENALTY: f64 = 40.0;
-/// Scans kept from each window for growing a part's model, and in all.
-const KEYFRAMES_PER_WINDOW: usize = 10;
-const MOST_KEYFRAMES: usize = 40;
 
 /// One closed window, ready to be learned.
 #[derive(Clone, Debug, Default)]
@@ -51,8 +51,16 @@ pub struct WindowJob {
     pub zero: crate::types::Stamp,
 }
 
+impl WindowJob {
+    /// Seconds since time zero of its first and last frame.
+    pub fn span_s(&self) -> (f64, f64) {
+        let time = |frame: Option<&Frame>| frame.map_or(0.0, |frame| frame.time_s);
+        (time(self.frames.first()), time(self.frames.last()))
+    }
+}
+
 /// Evidence for one parent of a part.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct ParentEvidence {
     /// `None`: whatever never moved.
     pub parent: Option<Label>,
@@ -60,29 +68,56 @@ pub struct ParentEvidence {
     pub log_evidence: [f64; 3],
     /// The fits of the moving types.
     pub fits: [Option<EdgeFit>; 3],
+    /// What each kept window adds to the evidence of no motion.
+    pub rigid_by_window: Vec<f64>,
+    /// What the windows gone by added to the evidence of each type; in `log_evidence`.
+    pub past: [f64; 3],
+}
+
+impl ParentEvidence {
+    /// What a kept window adds to the evidence of each type.
+    pub fn of_window(&self, window: usize) -> [f64; 3] {
+        let rigid = self.rigid_by_window.get(window).copied().unwrap_or(0.0);
+        // A type that fits worse than rest counts as rest.
+        std::array::from_fn(|slot| match &self.fits[slot] {
+            Some(fit) if self.past[slot] + fit.log_evidence >= self.log_evidence[slot] => {
+                fit.by_window.get(window).copied().unwrap_or(0.0)
+            }
+            _ => rigid,
+        })
+    }
 }
 
 /// Kinematic state of everything learned.
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Learner {
     /// The part fixed to the world.
     pub root: Label,
+    /// Whether it was given: else it is what the evidence says, and may change.
+    pub root_is_given: bool,
     /// Whether the tool's position is an observation.
     pub use_tool: bool,
-    /// Reference models.
+    /// Reference models; saved apart.
+    #[serde(skip)]
     pub models: BTreeMap<Label, PartModel>,
     /// Surfels of the first look.
-    reference: BTreeMap<Label, Vec<Surfel>>,
-    /// Scans that the models grow from, with their window and frame.
-    keyframes: BTreeMap<Label, Vec<(usize, usize, Vec<ScanPoint>)>>,
+    pub(super) reference: BTreeMap<Label, Vec<Surfel>>,
+    /// Scans that the models grow from.
+    pub(super) keyframes: BTreeMap<Label, Keyframes>,
     /// What scans cost at known poses.
     pub baselines: BTreeMap<Label, Baseline>,
     /// Parts that the tool has moved.
-    touched: BTreeSet<Label>,
+    pub(super) touched: BTreeSet<Label>,
+    /// Parts that moved in windows gone by.
+    pub(super) moved_before: BTreeSet<Label>,
+    /// How many windows are kept in full.
+    pub kept_windows: usize,
     /// Distance between the surfaces of each pair of parts at the first look \[m\], smaller label first.
+    #[serde(with = "pairs")]
     gaps: BTreeMap<(Label, Label), f64>,
     /// Displacements after the last window.
     pub displacements: BTreeMap<Label, Pose>,
-    /// Every window's measurements.
+    /// The measurements of the windows that are kept.
     pub windows: Vec<WindowObservations>,
     /// Displacement of each part in each window's frames, as fitted.
     pub tracks: BTreeMap<Label, Vec<Vec<Pose>>>,
@@ -98,6 +133,8 @@ pub struct Learner {
     pub critic: Critic,
     /// What learning each window's dynamics gave.
     pub inferences: Vec<WindowInference>,
+    /// Every window that was learned, kept or not.
+    pub records: Vec<WindowRecord>,
     /// Hulls of the parts, as first seen.
     pub hulls: BTreeMap<Label, HullProperties>,
 }
@@ -111,11 +148,14 @@ impl Learner {
         let models = reference.iter().filter_map(|(label, s)| Some((*label, PartModel::new(s, &[])?))).collect();
         Self {
             root,
+            root_is_given: true,
             use_tool,
             models,
             reference,
             keyframes: BTreeMap::new(),
             touched: BTreeSet::new(),
+            moved_before: BTreeSet::new(),
+            kept_windows: usize::MAX,
             gaps,
             baselines: BTreeMap::new(),
             displacements: BTreeMap::new(),
@@ -127,6 +167,7 @@ impl Learner {
             dynamics: DynamicsLearner::new(Vector3::new(0.0, 0.0, -9.81)),
             critic: Critic::default(),
             inferences: Vec::new(),
+            records: Vec::new(),
             hulls: BTreeMap::new(),
         }
     }
@@ -136,9 +177,12 @@ impl Learner {
         self.fit.as_ref().map_or(&[], |fit| &fit.joints)
     }
 
-    /// Sets the baselines from frames at the reference configuration.
+    /// Sets the baselines that are not known yet from frames at the reference configuration.
     pub fn calibrate(&mut self, frames: &[Frame]) {
         for (label, model) in &self.models {
+            if self.baselines.contains_key(label) {
+                continue;
+            }
             let scans: Vec<&Vec<ScanPoint>> =
                 frames.iter().filter_map(|f| f.scans.get(label)).filter(|scan| !scan.is_empty()).collect();
             if scans.is_empty() {
@@ -156,9 +200,9 @@ impl Learner {
         }
     }
 
-    /// Learns one window.
-    pub fn learn(&mut self, job: &WindowJob) {
-        let scene = Scene {
+    /// What a window's motion is explained with.
+    pub(super) fn scene<'a>(&'a self, job: &'a WindowJob) -> Scene<'a> {
+        Scene {
             frames: &job.frames,
             contacts: &job.contacts,
             models: &self.models,
@@ -166,10 +210,16 @@ impl Learner {
             start: &self.displacements,
             joints: self.joints(),
             touched_before: &self.touched,
-            root: self.root,
+            root: Some(self.root),
             use_tool: self.use_tool,
-        };
-        let motions = explain_window(&scene);
+        }
+    }
+
+    /// Learns one window.
+    pub fn learn(&mut self, job: &WindowJob) {
+        let scene = self.scene(job);
+        let doubted = !self.root_is_given && scene.has_left(self.root);
+        let motions = explain_window(&Scene { root: (!doubted).then_some(self.root), ..scene });
         for (label, motion) in &motions {
             tracing::debug!(%label, moved = motion.moved, excess = motion.excess, seed = ?motion.seed, "motion");
         }
@@ -202,7 +252,10 @@ impl Learner {
                 self.displacements.insert(*label, *end);
             }
         }
+        self.choose_root();
         self.learn_dynamics(job);
+        self.record(job);
+        self.retire();
     }
 
     fn learn_dynamics(&mut self, job: &WindowJob) {
@@ -212,7 +265,11 @@ impl Learner {
                 self.hulls.insert(*label, hull);
             }
         }
-        let Some(fit) = &self.fit else { return };
+        let Some(fit) = &self.fit else {
+            self.inferences.push(WindowInference::default());
+            self.dynamics.keep_window(&job.contacts);
+            return;
+        };
         let windows: Vec<&WindowObservations> = self.windows.iter().collect();
         let input = DynamicsInput {
             windows: &windows,
@@ -254,9 +311,40 @@ impl Learner {
 
     fn ever_moved(&self, label: Label) -> bool {
         let model = &self.models[&label];
-        self.tracks
+        self.moved_before.contains(&label)
+            || self
+            .tracks
             .get(&label)
             .is_some_and(|windows| windows.iter().flatten().any(|d| travel(model, &Pose::identity(), d) > MOVED))
+    }
+
+    /// A part that is met later than the others, with its surfels at the reference configuration.
+    pub(super) fn add_part(&mut self, label: Label, surfels: Vec<Surfel>, model: PartModel) {
+        let rested = self.windows.iter().map(|window| vec![Pose::identity(); window.times_s.len()]).collect();
+        self.tracks.insert(label, rested);
+        self.models.insert(label, model);
+        self.reference.insert(label, surfels);
+        self.gaps = surface_gaps(&self.reference);
+    }
+
+    /// The root, where it was not given: the largest of the parts that never moved in world; if all
+    /// did, the one that is seen to have gone least far.
+    fn choose_root(&mut self) {
+        if self.root_is_given {
+            return;
+        }
+        let farthest = |label: &Label| {
+            let model = &self.models[label];
+            let all = self.tracks.get(label).into_iter().flatten().flatten();
+            all.map(|displacement| travel(model, &Pose::identity(), displacement)).fold(0.0, f64::max)
+        };
+        let size = |label: &Label| self.reference.get(label).map_or(0, Vec::len);
+        let still = self.models.keys().filter(|label| !self.ever_moved(**label));
+        let largest = still.max_by_key(|label| (size(label), std::cmp::Reverse(**label)));
+        let least_far = || self.models.keys().min_by(|a, b| farthest(a).total_cmp(&farthest(b)));
+        if let Some(root) = largest.or_else(least_far).copied() {
+            self.root = root;
+        }
     }
 
     /// Evidence for every parent and type of every part that moved.
@@ -288,14 +376,16 @@ impl Learner {
         let track = parent.map(|p| self.tracks[&p].as_slice());
         let relative = relative_windows(child, track, &windows);
         let resting = self.resting_windows(child, parent);
-        let rigid = rigid_evidence(&part, &relative, &self.settings);
-        let mut option = ParentEvidence { parent, log_evidence: [rigid; 3], fits: [None, None, None] };
+        let (rigid, rigid_by_window) = rigid_evidence(&part, &relative, &self.settings);
+        let past = self.past_evidence(child, parent);
+        let log_evidence = past.map(|past| past + rigid);
+        let mut option = ParentEvidence { parent, log_evidence, fits: [None, None, None], rigid_by_window, past };
         for joint_type in [JointType::Prismatic, JointType::Revolute] {
             let starts = self.start_axes(&part, parent, joint_type, &relative, motions);
             let fit = moving_evidence(&part, joint_type, &starts, &relative, &resting, &self.settings);
             let slot = joint_type as usize;
             if let Some(fit) = fit {
-                option.log_evidence[slot] = option.log_evidence[slot].max(fit.log_evidence);
+                option.log_evidence[slot] = option.log_evidence[slot].max(past[slot] + fit.log_evidence);
                 option.fits[slot] = Some(fit);
             }
         }
@@ -328,7 +418,9 @@ impl Learner {
             return None;
         }
         let mut old = self.evidence.get(&child)?.iter().find(|o| o.parent == parent)?.clone();
+        old.rigid_by_window.push(0.0);
         for fit in old.fits.iter_mut().flatten() {
+            fit.by_window.push(0.0);
             let last = fit.positions.last().and_then(|w| w.last()).copied().unwrap_or(0.0);
             fit.positions.push(vec![last; self.windows.last().map_or(0, |w| w.times_s.len())]);
         }
@@ -440,15 +532,29 @@ impl Learner {
     fn fit_joints(&mut self) {
         let tree = self.likeliest();
         let index = |label: Label| tree.iter().position(|(l, ..)| *l == label);
-        let joints: Vec<KinematicJoint> = tree
+        // An edge is fitted anew after every window and may find its axis the other way round; what
+        // was learned of a joint counts along the direction that it had.
+        let turned: Vec<bool> = tree
             .iter()
             .map(|(child, parent, joint_type, axis)| {
+                self.joints().iter().any(|old| {
+                    let old_parent = old.parent.map(|p| self.joints()[p].child);
+                    (old.child, old_parent, old.joint_type) == (*child, *parent, *joint_type)
+                        && old.axis.direction.dot(&axis.direction) < 0.0
+                })
+            })
+            .collect();
+        let sign = |joint: usize| if turned[joint] { -1.0 } else { 1.0 };
+        let joints: Vec<KinematicJoint> = tree
+            .iter()
+            .enumerate()
+            .map(|(joint, (child, parent, joint_type, axis))| {
                 let part = self.part(*child);
                 KinematicJoint {
                     parent: parent.and_then(index),
                     child: *child,
                     joint_type: *joint_type,
-                    axis: *axis,
+                    axis: Axis { direction: axis.direction * sign(joint), ..*axis },
                     center: part.center,
                     radius: part.radius,
                     suggested: self.suggested_direction(*child, *parent, &axis.direction),
@@ -461,12 +567,16 @@ impl Learner {
         let positions = (0..self.windows.len())
             .map(|w| {
                 tree.iter()
-                    .map(|(child, parent, joint_type, _)| {
+                    .enumerate()
+                    .map(|(joint, (child, parent, joint_type, _))| {
                         self.evidence[child]
                             .iter()
                             .find(|o| o.parent == *parent)
                             .and_then(|o| o.fits[*joint_type as usize].as_ref())
-                            .map_or_else(|| vec![0.0; self.windows[w].times_s.len()], |f| f.positions[w].clone())
+                            .map_or_else(
+                                || vec![0.0; self.windows[w].times_s.len()],
+                                |f| f.positions[w].iter().map(|q| q * sign(joint)).collect(),
+                            )
                     })
                     .collect()
             })
@@ -508,22 +618,8 @@ impl Learner {
     fn grow(&mut self, job: &WindowJob, motions: &BTreeMap<Label, Motion>) {
         let window = self.windows.len() - 1;
         for (label, _) in motions.iter().filter(|(_, motion)| motion.moved) {
-            let keyframes = self.keyframes.entry(*label).or_default();
-            let every = job.frames.len().div_ceil(KEYFRAMES_PER_WINDOW).max(1);
-            for (frame, content) in job.frames.iter().enumerate().step_by(every) {
-                if let Some(scan) = content.scans.get(label) {
-                    keyframes.push((window, frame, scan.clone()));
-                }
-            }
-            while keyframes.len() > MOST_KEYFRAMES {
-                // Thin out the older half.
-                let mut index = 0;
-                let half = keyframes.len() / 2;
-                keyframes.retain(|_| {
-                    index += 1;
-                    index > half || index % 2 == 0
-                });
-            }
+            let scans = job.frames.iter().map(|frame| frame.scans.get(label));
+            self.keyframes.entry(*label).or_default().keep(window, scans);
         }
         self.rebuild_models();
     }
@@ -534,10 +630,8 @@ impl Learner {
             .keyframes
             .par_iter()
             .map(|(label, keyframes)| {
-                let mut later = SurfelAccumulator::default();
-                for (window, frame, scan) in keyframes {
-                    later.add(scan, &self.tracks[label][*window][*frame]);
-                }
+                let tracks = self.tracks.get(label).map_or(&[][..], Vec::as_slice);
+                let later = keyframes.accumulated(tracks);
                 let reference = self.reference.get(label).map_or(&[][..], Vec::as_slice);
                 (*label, PartModel::new(reference, &later.surfels()))
             })

@@ -1,26 +1,37 @@
 //! The one state machine that the node and the replay share.
 
+mod evaluate;
 mod explain;
 mod forecast;
+mod keyframes;
 mod learner;
 mod posterior;
+mod retention;
+mod saved;
 mod windows;
+mod worker;
 mod working_frame;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
 
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
+pub use evaluate::{PartScore, Scores};
 pub use explain::Frame;
 pub use learner::{Learner, ParentEvidence, WindowJob};
+pub use saved::{ResumeError, SavedObject, SavedObjectRef};
 pub use windows::{FrameAssembler, WindowCutter, WindowSettings};
+pub use worker::{ClosedWindow, Learned, Worker};
 
 use crate::math::Pose;
 use crate::model::{DeclaredPhysics, DynamicsLearner, KinematicSettings, PoseMeasurement};
 use crate::registration::{AlignmentSettings, Quadratic, SurfelAccumulator, align, truncated_cost};
 use crate::types::{Input, Label, Stamp};
+use evaluate::Scoring;
 use explain::{FEWEST_POINTS, measurement_of, travel};
 use forecast::Forecaster;
+use saved::Resumed;
 use windows::frame_of;
 use working_frame::WorkingFrame;
 
@@ -48,6 +59,9 @@ pub struct PipelineSettings {
     pub predict: bool,
     /// For prediction, a posterior counts from its window's close plus this \[s\].
     pub posterior_latency_s: f64,
+    /// The stream does not wait: closed windows are handed out for a [`Worker`] to learn, and
+    /// predictions hold the last wrench instead of waiting for the next.
+    pub live: bool,
 }
 
 /// What the pipeline says.
@@ -76,6 +90,17 @@ pub enum Output {
         /// Covariance of its centre of mass, held fixed in the part \[m²\].
         covariance_m2: Matrix3<f64>,
     },
+    /// A saved object was taken up at the stream's first frame.
+    Resumed {
+        /// Its root.
+        root: Label,
+        /// Parts that are not where the object has them, nor along their known joint.
+        unexplained: Vec<Label>,
+        /// Parts that the object did not have; they are added.
+        unknown: Vec<Label>,
+    },
+    /// A window closed, for a [`Worker`] to learn; only if live.
+    WindowClosed(Box<ClosedWindow>),
     /// A window was learned.
     Learned {
         /// Seconds since time zero of its first and last frame.
@@ -93,18 +118,31 @@ pub struct Pipeline {
     cutter: Option<WindowCutter>,
     accumulators: BTreeMap<Label, SurfelAccumulator>,
     reference: Vec<Frame>,
-    learner: Option<Learner>,
+    learner: Option<Arc<Learner>>,
     current: BTreeMap<Label, Pose>,
     recent: Vec<BTreeMap<Label, Pose>>,
     moving: bool,
+    /// Where the parts were when each window closed that was handed out and is not adopted yet, with
+    /// the window's number.
+    handed_out: VecDeque<(u64, BTreeMap<Label, Pose>)>,
+    closed_windows: u64,
     forecaster: Option<Forecaster>,
+    /// The latest stamp of a frame.
+    newest: Option<Stamp>,
+    /// Windows are scored, not learned.
+    scoring: Option<Scoring>,
+    /// A saved object that waits for the stream's first frame.
+    resumed: Option<Box<Resumed>>,
+    /// Where the stream's own time zero is on the object's clock \[s\].
+    begin_s: f64,
+    /// Frames at rest that show parts which the saved object does not have.
+    newcomers: Option<Vec<Frame>>,
 }
 
 impl Pipeline {
     /// A pipeline that has seen nothing.
     pub fn new(settings: PipelineSettings) -> Self {
-        let forecaster =
-            settings.predict.then(|| Forecaster::new(settings.root, settings.use_tool, settings.posterior_latency_s));
+        let forecaster = settings.predict.then(|| Forecaster::new(&settings));
         Self {
             forecaster,
             settings,
@@ -119,12 +157,30 @@ impl Pipeline {
             current: BTreeMap::new(),
             recent: Vec::new(),
             moving: false,
+            newest: None,
+            scoring: None,
+            resumed: None,
+            begin_s: 0.0,
+            newcomers: None,
+            handed_out: VecDeque::new(),
+            closed_windows: 0,
         }
+    }
+
+    /// Time zero: the earliest stamp of a cloud, a pose or a wrench; `None` before the first cloud.
+    pub fn zero(&self) -> Option<Stamp> {
+        self.zero
+    }
+
+    /// The stamp that outputs count their times from, and what the learner's clock says then \[s\]; `None`
+    /// before the first frame.
+    pub fn stream_zero(&self) -> Option<(Stamp, f64)> {
+        self.zero.map(|zero| (zero.plus_seconds(self.begin_s), self.begin_s))
     }
 
     /// What has been learned; `None` before the first window.
     pub fn learner(&self) -> Option<&Learner> {
-        self.learner.as_ref()
+        self.learner.as_deref()
     }
 
     /// One input, in the working frame.
@@ -155,14 +211,18 @@ impl Pipeline {
             outputs.extend(self.push_frame(stamp, &clouds));
         }
         let job = self.cutter.as_mut().and_then(|c| c.flush(nearest_label));
-        outputs.extend(job.map(|job| self.learn(&job)));
+        outputs.extend(job.and_then(|job| self.close(job)));
         outputs.extend(self.forecaster.iter_mut().flat_map(Forecaster::finish));
         outputs
     }
 
     fn push_frame(&mut self, stamp: Stamp, clouds: &[crate::types::SegmentedCloud]) -> Vec<Output> {
-        let zero =
-            *self.zero.get_or_insert_with(|| self.early.iter().map(Input::stamp).chain([stamp]).min().unwrap_or(stamp));
+        let zero = self.zero.unwrap_or_else(|| {
+            let first = self.early.iter().map(Input::stamp).chain([stamp]).min();
+            self.time_zero(first.unwrap_or(stamp))
+        });
+        self.zero = Some(zero);
+        self.newest = self.newest.max(Some(stamp));
         let cutter = self.cutter.get_or_insert_with(|| WindowCutter::new(self.settings.windows, zero));
         for input in self.early.drain(..) {
             if let Input::Wrench(wrench) = input {
@@ -170,7 +230,8 @@ impl Pipeline {
             }
         }
         let frame = frame_of(stamp.seconds_since(zero), clouds);
-        let mut outputs = self.observe(&frame);
+        let mut outputs: Vec<Output> = self.take_up(&frame, zero).into_iter().collect();
+        outputs.extend(self.observe(&frame));
         let moving = self.moving;
         let seen = self.forecaster.is_some().then(|| frame.clone());
         if !self.cutter.as_ref().is_some_and(WindowCutter::is_open) && self.learner.is_none() {
@@ -184,18 +245,27 @@ impl Pipeline {
                 });
             }
         }
+        if let Some(frames) = self.newcomers.as_mut().filter(|frames| frames.len() < REFERENCE_FRAMES) {
+            frames.push(frame.clone());
+        }
         let job = self.cutter.as_mut().and_then(|c| c.push_frame(frame, moving, nearest_label));
+        if self.cutter.as_ref().is_some_and(WindowCutter::is_open)
+            && let Some(frames) = self.newcomers.take()
+            && let Some(learner) = &mut self.learner
+        {
+            Arc::make_mut(learner).add_parts(&frames);
+        }
         if self.learner.is_none() && self.cutter.as_ref().is_some_and(WindowCutter::is_open) {
             self.open_reference();
         }
-        let closed = job.is_some();
-        outputs.extend(job.map(|job| self.learn(&job)));
+        let closed = job.is_some() && !self.settings.live;
+        outputs.extend(job.and_then(|job| self.close(job)));
         if let (Some(forecaster), Some(frame)) = (&mut self.forecaster, seen) {
-            if let Some(learner) = self.learner.as_ref().filter(|_| closed) {
-                forecaster.learned(learner);
+            if let Some(learner) = self.learner.as_deref().filter(|_| closed) {
+                forecaster.learned(learner, None);
             }
             let rest_force = self.cutter.as_ref().and_then(|cutter| cutter.rest_force).unwrap_or_default();
-            outputs.extend(forecaster.push_frame(frame, self.learner.as_ref(), zero, rest_force));
+            outputs.extend(forecaster.push_frame(frame, self.learner.as_deref(), zero, rest_force));
         }
         outputs
     }
@@ -217,20 +287,54 @@ impl Pipeline {
         });
         let mut learner = Learner::new(root, self.settings.use_tool, accumulators);
         learner.settings = self.settings.kinematics;
+        learner.kept_windows = self.settings.windows.kept;
+        learner.root_is_given = self.settings.root.is_some();
         learner.dynamics = DynamicsLearner::new(self.gravity_in_work()).declaring(self.settings.declared.clone());
         learner.calibrate(&self.reference);
         self.reference.clear();
-        self.learner = Some(learner);
+        self.learner = Some(Arc::new(learner));
     }
 
-    fn learn(&mut self, job: &WindowJob) -> Output {
-        let ends = |f: Option<&Frame>| f.map_or(0.0, |f| f.time_s);
-        let span_s = (ends(job.frames.first()), ends(job.frames.last()));
-        if let Some(learner) = &mut self.learner {
-            learner.learn(job);
+    /// A window that closed is learned here, or handed out if live.
+    fn close(&mut self, job: WindowJob) -> Option<Output> {
+        let learner = self.learner.as_mut()?;
+        if let Some(scoring) = &mut self.scoring {
+            let learner = Arc::make_mut(learner);
+            scoring.score(learner, &job);
             self.current.extend(learner.displacements.iter().map(|(l, d)| (*l, *d)));
+            return None;
         }
-        Output::Learned { span_s }
+        if self.settings.live {
+            self.closed_windows += 1;
+            self.handed_out.push_back((self.closed_windows, self.current.clone()));
+            let window = ClosedWindow::new(self.closed_windows, job, Arc::clone(learner));
+            return Some(Output::WindowClosed(Box::new(window)));
+        }
+        Arc::make_mut(learner).learn(&job);
+        self.current.extend(learner.displacements.iter().map(|(l, d)| (*l, *d)));
+        Some(Output::Learned { span_s: job.span_s() })
+    }
+
+    /// Takes over what a worker learned from a window handed out; older ones are not waited for any
+    /// more. Parts go on from where learning has them at the window's close, as far as they were seen
+    /// to go since.
+    pub fn adopt(&mut self, learned: &Learned) -> Output {
+        let mut at_close = BTreeMap::new();
+        while let Some((_, poses)) = self.handed_out.pop_front_if(|(number, _)| *number <= learned.sequence) {
+            at_close = poses;
+        }
+        for (label, learned_pose) in &learned.learner.displacements {
+            let since = match (at_close.get(label), self.current.get(label)) {
+                (Some(before), Some(now)) if before != now => *now * before.inverse(),
+                _ => Pose::identity(),
+            };
+            self.current.insert(*label, since * *learned_pose);
+        }
+        self.learner = Some(Arc::clone(&learned.learner));
+        if let Some(forecaster) = &mut self.forecaster {
+            forecaster.learned(&learned.learner, Some(&self.current));
+        }
+        Output::Learned { span_s: learned.span_s }
     }
 
     /// Registers every part of a frame, from where it was.

@@ -1,18 +1,19 @@
 //! The posterior as it is published: what the learner knows, over all trees.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use nalgebra::{DMatrix, Matrix3, Vector3};
 
 use super::{Learner, ParentEvidence, Pipeline};
 use crate::geometry::hull_properties;
 use crate::mechanism::JointType;
-use crate::model::{Axis, DynamicsPosterior, JointDynamics, KinematicFit, WindowInference, WindowObservations};
+use crate::model::{Axis, DynamicsPosterior, JointDynamics, KinematicFit};
+use crate::registration::PartModel;
 use crate::structure::TreeDistribution;
 use crate::types::Label;
 use crate::types::posterior::{
     Criticism, EdgePosterior, InformedBy, JointTypeProbabilities, ObjectPosterior, PartPosterior, PrismaticAxis,
-    Quantity, RevoluteAxis, WindowRecord,
+    Quantity, RevoluteAxis,
 };
 
 /// Density of furniture parts over their hull, median \[kg/m³\] and standard deviation of its log:
@@ -24,47 +25,51 @@ const CENTER_SHARE: f64 = 0.3;
 impl Pipeline {
     /// What is believed now, in the working frame.
     pub(super) fn posterior_in_work(&self) -> Option<ObjectPosterior> {
-        let points = self.points();
-        let root = match (&self.learner, self.settings.root) {
-            (Some(learner), _) => learner.root,
-            (None, Some(root)) => root,
-            (None, None) => points.iter().max_by_key(|(_, points)| points.len()).map(|(label, _)| *label)?,
-        };
-        let labels: Vec<Label> = points.keys().copied().collect();
-        let mut parts: Vec<PartPosterior> = points.iter().filter_map(|(label, points)| part(*label, points)).collect();
-        let dynamics = self.learner.as_ref().and_then(|learner| learner.dynamics.posterior().ok());
-        for learned in dynamics.iter().flat_map(|dynamics| &dynamics.parts) {
-            if let Some(part) = parts.iter_mut().find(|part| part.label == learned.label) {
-                part.com_in_world_m = learned.com_in_world.into();
-                part.com_covariance_m2 = learned.com_covariance.into();
-                part.mass_kg = learned.mass.clone();
-            }
-        }
-        let known = self.learner.as_ref().map(|learner| Known { learner, dynamics: dynamics.as_ref() });
-        Some(ObjectPosterior {
-            root_label: root,
-            parts,
-            edges: edges(root, &labels, known),
-            windows: self.learner.as_ref().map(window_records).unwrap_or_default(),
-            criticism: self.learner.as_ref().map_or_else(Criticism::insufficient, |learner| learner.critic.findings()),
-        })
-    }
-
-    /// Points of each part's surface at the reference configuration \[m\].
-    fn points(&self) -> BTreeMap<Label, Vec<Vector3<f64>>> {
         if let Some(learner) = &self.learner {
-            return learner
-                .models
-                .iter()
-                .map(|(label, model)| (*label, model.surfels.iter().map(|s| s.point).collect()))
-                .collect();
+            return Some(learner.posterior());
         }
         let mut points: BTreeMap<Label, Vec<Vector3<f64>>> = BTreeMap::new();
         let last = self.reference.last().into_iter().flat_map(|frame| &frame.scans);
         for (label, scan) in last {
             points.entry(*label).or_default().extend(scan.iter().map(|p| p.point_in_world));
         }
-        points
+        let likeliest = || points.iter().max_by_key(|(_, points)| points.len()).map(|(label, _)| *label);
+        Some(posterior(self.settings.root.or_else(likeliest)?, &points, None))
+    }
+}
+
+impl Learner {
+    /// What is believed by what was learned.
+    pub(super) fn posterior(&self) -> ObjectPosterior {
+        let surface = |model: &PartModel| model.surfels.iter().map(|s| s.point).collect();
+        let points = self.models.iter().map(|(label, model)| (*label, surface(model))).collect();
+        posterior(self.root, &points, Some(self))
+    }
+}
+
+/// `points`: of each part's surface at the reference configuration \[m\].
+fn posterior(
+    root_label: Label,
+    points: &BTreeMap<Label, Vec<Vector3<f64>>>,
+    learner: Option<&Learner>,
+) -> ObjectPosterior {
+    let labels: Vec<Label> = points.keys().copied().collect();
+    let mut parts: Vec<PartPosterior> = points.iter().filter_map(|(label, points)| part(*label, points)).collect();
+    let dynamics = learner.and_then(|learner| learner.dynamics.posterior().ok());
+    for learned in dynamics.iter().flat_map(|dynamics| &dynamics.parts) {
+        if let Some(part) = parts.iter_mut().find(|part| part.label == learned.label) {
+            part.com_in_world_m = learned.com_in_world.into();
+            part.com_covariance_m2 = learned.com_covariance.into();
+            part.mass_kg = learned.mass.clone();
+        }
+    }
+    let known = learner.map(|learner| Known { learner, dynamics: dynamics.as_ref() });
+    ObjectPosterior {
+        root_label,
+        parts,
+        edges: edges(root_label, &labels, known),
+        windows: learner.map(|learner| learner.records.clone()).unwrap_or_default(),
+        criticism: learner.map_or_else(Criticism::insufficient, |learner| learner.critic.findings()),
     }
 }
 
@@ -87,29 +92,6 @@ fn part(label: Label, points: &[Vector3<f64>]) -> Option<PartPosterior> {
 struct Known<'a> {
     learner: &'a Learner,
     dynamics: Option<&'a DynamicsPosterior>,
-}
-
-fn window_records(learner: &Learner) -> Vec<WindowRecord> {
-    // The first windows may have had no joint to infer the dynamics of.
-    let without = learner.windows.len().saturating_sub(learner.inferences.len());
-    let inferences = std::iter::repeat_n(None, without).chain(learner.inferences.iter().map(Some));
-    learner.windows.iter().zip(inferences).map(|(window, inference)| window_record(window, inference)).collect()
-}
-
-fn window_record(window: &WindowObservations, inference: Option<&WindowInference>) -> WindowRecord {
-    let touched: BTreeSet<Label> = window.contacts.iter().map(|contact| contact.label).collect();
-    let end = |time: Option<&f64>| time.copied().unwrap_or_default();
-    let learned = inference.filter(|inference| inference.failure.is_none());
-    WindowRecord {
-        t0_s: end(window.times_s.first()),
-        t1_s: end(window.times_s.last()),
-        labels: touched.into_iter().collect(),
-        frames: window.times_s.len(),
-        steps: inference.map_or(0, |inference| inference.steps),
-        inference_wall_s: 0.0,
-        elbo: learned.map(|inference| inference.elbo),
-        log_predictive_density: learned.map(|inference| inference.log_predictive_density),
-    }
 }
 
 fn edges(root: Label, labels: &[Label], known: Option<Known<'_>>) -> Vec<EdgePosterior> {

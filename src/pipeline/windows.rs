@@ -25,11 +25,13 @@ pub struct WindowSettings {
     pub quiet_s: f64,
     /// It closes at this length in any case \[s\].
     pub longest_s: f64,
+    /// How many windows are kept in full, the most informative ones; the others leave summaries.
+    pub kept: usize,
 }
 
 impl Default for WindowSettings {
     fn default() -> Self {
-        Self { force_threshold_n: 0.3, smoothing_s: 0.064, lead_s: 0.3, quiet_s: 0.35, longest_s: 5.0 }
+        Self { force_threshold_n: 0.3, smoothing_s: 0.064, lead_s: 0.3, quiet_s: 0.35, longest_s: 5.0, kept: 12 }
     }
 }
 

@@ -41,13 +41,15 @@ impl Pipeline {
         let world_from_work = self.world_from_work();
         let work_from_world = world_from_work.inverse();
         let outputs = pending.into_iter().flat_map(|input| self.push_carried(carried_input(input, &work_from_world)));
-        outputs.collect::<Vec<_>>().into_iter().map(|output| carried_output(output, &world_from_work)).collect()
+        let outputs: Vec<Output> = outputs.collect();
+        outputs.into_iter().map(|output| carried_output(output, &world_from_work, self.begin_s)).collect()
     }
 
     /// Ends the stream: what is open is closed and learned.
     pub fn finish(&mut self) -> Vec<Output> {
         let world_from_work = self.world_from_work();
-        self.finish_carried().into_iter().map(|output| carried_output(output, &world_from_work)).collect()
+        let outputs = self.finish_carried();
+        outputs.into_iter().map(|output| carried_output(output, &world_from_work, self.begin_s)).collect()
     }
 
     /// What is believed now; before the first window, the prior. `None` while no part was seen.
@@ -125,19 +127,21 @@ fn carried_input(input: Input, work_from_world: &Pose) -> Input {
     }
 }
 
-fn carried_output(output: Output, world_from_work: &Pose) -> Output {
+/// In world, times from the stream's own zero.
+fn carried_output(output: Output, world_from_work: &Pose, begin_s: f64) -> Output {
     match output {
         Output::Observation { time_s, label, measurement } => {
             let displacement = *world_from_work * measurement.displacement * world_from_work.inverse();
             let information = turned(&measurement.information, &world_from_work.rotation);
-            Output::Observation { time_s, label, measurement: PoseMeasurement { displacement, information } }
+            Output::Observation { time_s: time_s - begin_s, label, measurement: PoseMeasurement { displacement, information } }
         }
         Output::Prediction { time_s, horizon_s, label, displacement, covariance_m2 } => {
             let displacement = *world_from_work * displacement * world_from_work.inverse();
             let covariance_m2 = world_from_work.rotation * covariance_m2 * world_from_work.rotation.transpose();
-            Output::Prediction { time_s, horizon_s, label, displacement, covariance_m2 }
+            Output::Prediction { time_s: time_s - begin_s, horizon_s, label, displacement, covariance_m2 }
         }
-        Output::Learned { span_s } => Output::Learned { span_s },
+        Output::WindowClosed(window) => Output::WindowClosed(Box::new(window.carried_out(world_from_work))),
+        other => other,
     }
 }
 

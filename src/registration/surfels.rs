@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use nalgebra::{Matrix3, Vector3};
+use serde::{Deserialize, Serialize};
 
 use super::ScanPoint;
 use super::field::NearestField;
@@ -29,7 +30,8 @@ const GOLDEN: f64 = 1.618_033_988_749_895;
 const FULL_VOXEL: f64 = 400.0;
 
 /// A small piece of surface at the reference configuration.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(from = "StoredSurfel", into = "StoredSurfel")]
 pub struct Surfel {
     /// Centre \[m\].
     pub point: Vector3<f64>,
@@ -41,6 +43,21 @@ pub struct Surfel {
     pub sided: bool,
     /// Whether it was first seen after the part had moved, and so stands where the fit put it.
     pub grown: bool,
+}
+
+/// A surfel without names: there are thousands. Point, normal, sigma, sided, grown.
+type StoredSurfel = ([f64; 3], [f64; 3], f64, bool, bool);
+
+impl From<Surfel> for StoredSurfel {
+    fn from(Surfel { point, normal, sigma, sided, grown }: Surfel) -> Self {
+        (point.into(), normal.into(), sigma, sided, grown)
+    }
+}
+
+impl From<StoredSurfel> for Surfel {
+    fn from((point, normal, sigma, sided, grown): StoredSurfel) -> Self {
+        Self { point: point.into(), normal: normal.into(), sigma, sided, grown }
+    }
 }
 
 #[derive(Clone, Debug, Default)]
@@ -263,11 +280,20 @@ impl PartModel {
             })
         };
         let grown: Vec<Surfel> = later.iter().filter(new_face).map(|s| Surfel { grown: true, ..*s }).collect();
+        Some(first.with(reference, &grown))
+    }
+
+    /// The model of surfels of the first look and of those that were taken for new faces.
+    pub fn grown(reference: &[Surfel], grown: &[Surfel]) -> Option<Self> {
+        (reference.len() >= FEWEST_SURFELS).then(|| Self::of(reference.to_vec()).with(reference, grown))
+    }
+
+    fn with(self, reference: &[Surfel], grown: &[Surfel]) -> Self {
         if grown.is_empty() {
-            return Some(first);
+            return self;
         }
-        let (centroid, radius) = (first.centroid, first.radius);
-        Some(Self { centroid, radius, ..Self::of([reference, &grown].concat()) })
+        let (centroid, radius) = (self.centroid, self.radius);
+        Self { centroid, radius, ..Self::of([reference, grown].concat()) }
     }
 
     fn of(surfels: Vec<Surfel>) -> Self {

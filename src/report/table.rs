@@ -1,8 +1,8 @@
 //! The table of what was found: at most 100 columns, part by part.
 
-use std::collections::BTreeMap;
 use std::fmt::Write;
 
+use super::found::Found;
 use crate::io::counters::{ByReason, Counters};
 use crate::io::document::PosteriorDocument;
 use crate::types::Label;
@@ -11,8 +11,6 @@ use crate::types::posterior::{
     WindowRecord,
 };
 
-/// A type less likely than this is open: what never moved stays so.
-const SETTLED: f64 = 0.9;
 /// Longer lists of an effect's parameters (tables) are cut.
 const MOST_PARAMETERS: usize = 8;
 
@@ -49,9 +47,9 @@ pub fn table(run: &Run<'_>) -> String {
             continue;
         }
         let Some(joint) = found.joint(*label) else { continue };
-        let (name, type_probability) = joint.types.likeliest();
+        let type_probability = joint.types.likeliest().1;
         let on = format!("{:>width$} {:.3}", joint.edge.parent.to_string(), joint.probability);
-        if type_probability <= SETTLED {
+        let Some(name) = joint.settled() else {
             let JointTypeProbabilities { rigid, prismatic, revolute } = joint.types;
             line(
                 &mut text,
@@ -60,7 +58,7 @@ pub fn table(run: &Run<'_>) -> String {
                 ),
             );
             continue;
-        }
+        };
         line(&mut text, &format!("{label:>width$}  {on}   {name} {type_probability:.3}"));
         for detail in details(joint.edge, name) {
             line(&mut text, &format!("{margin}{detail}"));
@@ -88,73 +86,13 @@ fn line(text: &mut String, content: &str) {
     text.push('\n');
 }
 
-fn labels_of(posterior: &ObjectPosterior) -> Vec<Label> {
+pub(super) fn labels_of(posterior: &ObjectPosterior) -> Vec<Label> {
     let ends = posterior.edges.iter().flat_map(|edge| [edge.parent, edge.child]);
     let parts = posterior.parts.iter().map(|part| part.label);
     let mut labels: Vec<Label> = ends.chain(parts).chain([posterior.root_label]).collect();
     labels.sort_unstable();
     labels.dedup();
     labels
-}
-
-/// The edges by child, and which parts never moved.
-struct Found<'a> {
-    root: Label,
-    by_child: BTreeMap<Label, Vec<&'a EdgePosterior>>,
-    at_rest: Vec<Label>,
-}
-
-/// The joint that carries a part, as shown.
-struct Joint<'a> {
-    edge: &'a EdgePosterior,
-    probability: f64,
-    types: JointTypeProbabilities,
-}
-
-impl<'a> Found<'a> {
-    fn new(posterior: &'a ObjectPosterior) -> Self {
-        let mut by_child: BTreeMap<Label, Vec<&EdgePosterior>> = BTreeMap::new();
-        for edge in &posterior.edges {
-            by_child.entry(edge.child).or_default().push(edge);
-        }
-        let open = |edges: &Vec<&EdgePosterior>| types_over(edges).likeliest().1 <= SETTLED;
-        let at_rest = by_child.iter().filter(|(_, edges)| open(edges)).map(|(label, _)| *label).collect();
-        Self { root: posterior.root_label, by_child, at_rest }
-    }
-
-    /// The likeliest parent; the parts that never moved count as one with the root, which stands
-    /// for them: which of them carries a joint is beyond the data.
-    fn joint(&self, child: Label) -> Option<Joint<'a>> {
-        let edges = self.by_child.get(&child)?;
-        let rests = |label: Label| label == self.root || self.at_rest.contains(&label);
-        let with_root: f64 = edges.iter().filter(|edge| rests(edge.parent)).map(|edge| edge.probability).sum();
-        let likelier = |a: &&&EdgePosterior, b: &&&EdgePosterior| {
-            a.probability.total_cmp(&b.probability).then(b.parent.cmp(&a.parent))
-        };
-        let moving = edges.iter().filter(|edge| !rests(edge.parent)).max_by(likelier);
-        let types = types_over(edges);
-        match moving {
-            Some(edge) if edge.probability > with_root => Some(Joint { edge, probability: edge.probability, types }),
-            _ => {
-                let of_root = edges.iter().find(|edge| edge.parent == self.root);
-                let edge = of_root.or_else(|| edges.iter().filter(|edge| rests(edge.parent)).max_by(likelier))?;
-                Some(Joint { edge, probability: with_root, types })
-            }
-        }
-    }
-}
-
-/// The types of a part's joint, over all its parents.
-fn types_over(edges: &[&EdgePosterior]) -> JointTypeProbabilities {
-    let total: f64 = edges.iter().map(|edge| edge.probability).sum();
-    let mean = |of: fn(&JointTypeProbabilities) -> f64| {
-        edges.iter().map(|edge| edge.probability * of(&edge.joint_type)).sum::<f64>() / total.max(f64::MIN_POSITIVE)
-    };
-    JointTypeProbabilities {
-        rigid: mean(|t| t.rigid),
-        prismatic: mean(|t| t.prismatic),
-        revolute: mean(|t| t.revolute),
-    }
 }
 
 fn details(edge: &EdgePosterior, joint_type: &str) -> Vec<String> {
@@ -199,7 +137,7 @@ fn interval(q: &Quantity) -> String {
 }
 
 /// Three significant digits.
-fn significant(x: f64) -> String {
+pub(super) fn significant(x: f64) -> String {
     let magnitude = x.abs();
     match magnitude {
         _ if magnitude == 0.0 => "0".to_owned(),

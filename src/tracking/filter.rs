@@ -1,8 +1,13 @@
-//! An extended Kalman filter over joint positions, rates and the point that the tool holds.
+//! An extended Kalman filter over joint positions, rates, the point that the tool holds, an unexplained
+//! force on each joint, and the numbers of the dynamics.
 //!
-//! Mean by simulation: ẋ = (q̇, M⁻¹(τ − d q̇ + λ + Jᵀ w − c − g)), so that friction sticks: a joint that
-//! no force moves stays exactly where it is. Covariance by q̇ ← α q̇ with α = 1/(1 + h d/M_jj), and the
-//! white generalized force that the wrench sensor's noise makes, times κ for what the model misses.
+//! Mean by simulation: ẋ = (q̇, M⁻¹(τ + u − d q̇ + λ + Jᵀ w − c − g)), so that friction sticks: a joint that
+//! no force moves stays exactly where it is. u fades as e^(−t/T) and is driven by white noise
+//! (Ornstein–Uhlenbeck); friction, damping, inertia and the rest start from the posterior and move with
+//! what the tool shows. Covariance by statistical linearization: central differences of the simulation,
+//! one standard deviation to both sides, so that stick and slip are seen from either side (Gelb,
+//! "Applied Optimal Estimation", 1974, section 6.2). Process noise: the white generalized force that the
+//! wrench sensor's noise makes, times κ for what the model misses.
 //! Corrections: x − o = D(q) p by the tool, log(T(−c) D_obs⁻¹ D(q) T(c)) = 0 by every cloud.
 
 use std::sync::Arc;
@@ -10,16 +15,25 @@ use std::sync::Arc;
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, SMatrix, SVector, Vector3, Vector6};
 
 use super::mechanism::TrackedMechanism;
-use crate::math::{Pose, skew};
-use crate::mechanism::{BodyWrench, Spatial, State, Step, Workspace, WrenchPoint, WrenchSample, WrenchTrack, step};
+use super::simulation::{DISTURBANCE_MEMORY, Drive};
+use crate::math::Pose;
+use crate::mechanism::{Spatial, State, Tree, Workspace, WrenchSample};
 use crate::model::PoseMeasurement;
 use crate::types::Label;
 
 /// Longest step \[s\].
 pub(super) const STEP: f64 = 0.004;
+/// Longest span that is linearized at once \[s\].
+const LINEAR: f64 = 0.1;
 /// Density of the white force that moves a held part beside what was read \[N²·s\]: a sensor of .1 N at
 /// 125 Hz.
 pub(super) const FORCE_DENSITY: f64 = 0.1 * 0.1 * 0.008;
+/// Standard deviation of the unexplained force in units of the joint's friction.
+const DISTURBANCE: f64 = 0.1;
+/// Logarithms of friction, damping and inertia wander by this in a second.
+const NUMBER_DRIFT: f64 = 0.02;
+/// The posterior's logarithms are not trusted beyond this, nor carry a linearization further than that.
+const NUMBER_DEVIATION: (f64, f64) = (0.03, 0.7);
 /// A stuck joint forgets how its rate may be wrong within this \[s\].
 const STUCK_MEMORY: f64 = 0.03;
 /// Registration error that the frames share \[m\].
@@ -46,13 +60,29 @@ pub struct Held {
     pub point: Vector3<f64>,
 }
 
+/// What a simulation starts from.
+pub(super) struct Start {
+    pub tree: Tree<f64>,
+    pub state: State<f64>,
+    pub disturbance: Vec<f64>,
+    pub held: Option<Held>,
+}
+
 /// Positions and rates of all joints with their covariance.
 #[derive(Clone, Debug)]
 pub struct Filter {
     pub(super) mechanism: Arc<TrackedMechanism>,
     pub(super) time_s: f64,
     pub(super) state: State<f64>,
-    /// Of (positions, rates, held point).
+    /// Unexplained force on each joint \[N or N·m\].
+    pub(super) disturbance: Vec<f64>,
+    /// The dynamics' numbers ...
+    pub(super) numbers: DVector<f64>,
+    /// ... and their tree.
+    pub(super) tree: Tree<f64>,
+    /// Whether the tool's track moves the numbers.
+    adapts: bool,
+    /// Of (positions, rates, held point, disturbance, active numbers).
     pub(super) covariance: DMatrix<f64>,
     pub(super) held: Option<Held>,
     workspace: Workspace<f64>,
@@ -64,7 +94,9 @@ pub struct Filter {
     /// Joints that what is held does not follow.
     pub(super) distrusted: Vec<bool>,
     /// Positions at the start.
-    start: Vec<f64>,
+    started_at: Vec<f64>,
+    /// Least and greatest position of each joint so far.
+    pub(super) explored: Vec<[f64; 2]>,
     cursor: usize,
 }
 
@@ -79,20 +111,33 @@ impl Filter {
         (deviation, rate_deviation): (f64, f64),
     ) -> Self {
         let n = mechanism.joints.len();
-        let mut covariance = DMatrix::zeros(2 * n + 3, 2 * n + 3);
+        let count = mechanism.active.len();
+        let mut covariance = DMatrix::zeros(3 * n + 3 + count, 3 * n + 3 + count);
         let inertias = mechanism.tree.mass_matrix(&positions).diagonal().iter().map(|m| m.max(1e-9)).collect();
         for joint in 0..n {
-            let reach = reach(&mechanism, joint);
+            let reach = mechanism.reach(joint);
             covariance[(joint, joint)] = (deviation / reach).powi(2);
             covariance[(n + joint, n + joint)] =
                 if rates[joint] == 0.0 { 0.0 } else { (rate_deviation / reach).powi(2) };
+            covariance[(2 * n + 3 + joint, 2 * n + 3 + joint)] =
+                (DISTURBANCE * mechanism.tree.bodies()[joint].parameters.friction).powi(2);
+        }
+        let start_of_numbers = 3 * n + 3;
+        covariance.view_mut((start_of_numbers, start_of_numbers), (count, count)).copy_from(&mechanism.covariance);
+        for i in start_of_numbers..start_of_numbers + count {
+            covariance[(i, i)] += NUMBER_DEVIATION.0.powi(2);
         }
         let workspace = Workspace::new(&mechanism.tree);
         let start = positions.clone();
         let state = State::new(positions, rates);
         Self {
-            start,
+            started_at: start,
+            explored: mechanism.explored.clone(),
             distrusted: vec![false; n],
+            disturbance: vec![0.0; n],
+            numbers: mechanism.numbers.clone(),
+            tree: mechanism.tree.clone(),
+            adapts: true,
             mechanism,
             time_s,
             state,
@@ -104,6 +149,11 @@ impl Filter {
             surprise: 1.0,
             cursor: 0,
         }
+    }
+
+    /// Whether the tool's track may move the numbers of the dynamics: not where the posterior has seen it.
+    pub fn set_adapting(&mut self, adapts: bool) {
+        self.adapts = adapts;
     }
 
     /// What it filters.
@@ -143,7 +193,7 @@ impl Filter {
     pub fn lose(&mut self, label: Label) {
         let Some(body) = self.mechanism.body(label) else { return };
         for joint in self.mechanism.chain(body) {
-            self.state.positions[joint] = self.start[joint];
+            self.state.positions[joint] = self.started_at[joint];
             self.state.rates[joint] = 0.0;
         }
         self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
@@ -198,12 +248,11 @@ impl Filter {
         let slope = self.point_slopes(&Held { body, point });
         let turn = displacement.rotation.transpose();
         let map = -(turn * slope);
-        let joints = self.covariance.view((0, 0), (n, 2 * n)).into_owned();
-        let cross = &map * joints;
+        let cross = &map * self.covariance.rows(0, n);
         let own = &map * self.covariance.view((0, 0), (n, n)) * map.transpose()
             + Matrix3::identity() * (sigma_m.powi(2) + HELD_DEVIATION.powi(2));
-        self.covariance.view_mut((2 * n, 0), (3, 2 * n)).copy_from(&cross);
-        self.covariance.view_mut((0, 2 * n), (2 * n, 3)).copy_from(&cross.transpose());
+        self.covariance.rows_mut(2 * n, 3).copy_from(&cross);
+        self.covariance.columns_mut(2 * n, 3).copy_from(&cross.transpose());
         self.covariance.view_mut((2 * n, 2 * n), (3, 3)).copy_from(&own);
     }
 
@@ -229,56 +278,153 @@ impl Filter {
 
     /// Simulates on to `to_s` under the wrenches read.
     pub fn advance(&mut self, to_s: f64, samples: &[WrenchSample]) {
-        let span = to_s - self.time_s;
-        if span <= 0.0 {
+        if to_s <= self.time_s {
             return;
         }
         if self.rests() {
+            let span = to_s - self.time_s;
             self.time_s = to_s;
             self.forget_rates(span);
+            self.fade(span);
             return;
         }
-        let mechanism = Arc::clone(&self.mechanism);
-        let count = (span / STEP - 1e-6).ceil().max(1.0) as usize;
-        let length_s = span / count as f64;
-        let track = self.held.map(|held| WrenchTrack {
-            point: WrenchPoint::Carried(held.point),
-            ..WrenchTrack::new(held.body, samples)
-        });
-        let resting = self.resting();
-        for i in 0..count {
-            let middle_s = self.time_s + (i as f64 + 0.5) * length_s;
-            let wrench: Option<BodyWrench<f64>> = track.as_ref().map(|track| track.wrench(middle_s, &mut self.cursor));
-            let applied = Step { middle_s, length_s };
-            step(&mechanism.tree, &mut self.state, wrench.as_slice(), applied, &mut self.workspace);
-            keep(&resting, &mut self.state);
+        let first = samples.partition_point(|s| s.stamp_s < self.time_s - 0.05);
+        let last = samples.partition_point(|s| s.stamp_s <= to_s + 0.02);
+        let samples = &samples[first..last.max(first)];
+        self.cursor = 0;
+        let pieces = ((to_s - self.time_s) / LINEAR - 1e-6).ceil().max(1.0) as usize;
+        let from_s = self.time_s;
+        for piece in 1..=pieces {
+            let end_s = if piece == pieces { to_s } else { from_s + (to_s - from_s) * piece as f64 / pieces as f64 };
+            self.advance_piece(end_s, samples);
         }
-        self.time_s = to_s;
-        self.grow(span);
     }
 
-    /// The covariance over a span \[s\].
-    fn grow(&mut self, span: f64) {
+    fn advance_piece(&mut self, to_s: f64, samples: &[WrenchSample]) {
         let n = self.mechanism.joints.len();
+        let span = [self.time_s, to_s];
+        let joints = self.moving_joints();
+        let resting = self.resting();
+        let drive = Drive { held: self.held, samples, resting: &resting, step_s: STEP };
+        let coordinates = self.coordinates_of(&joints);
+        // (q, q̇) of the moving joints by each of their coordinates.
+        let mut slopes = DMatrix::zeros(2 * joints.len(), coordinates.len());
+        for (column, &at) in coordinates.iter().enumerate() {
+            let deviation = self.covariance[(at, at)].max(0.0).sqrt();
+            let size = deviation.min(self.largest_step(at));
+            if size < 1e-9 {
+                if at < 2 * n {
+                    let own = joints.iter().position(|&joint| joint == at % n).map(|k| k + (at / n) * joints.len());
+                    own.into_iter().for_each(|row| slopes[(row, column)] = 1.0);
+                }
+                continue;
+            }
+            let ends = [size, -size].map(|change| self.run_changed(at, change, &drive, span));
+            let [Some(plus), Some(minus)] = ends else { continue };
+            for (k, &joint) in joints.iter().enumerate() {
+                slopes[(k, column)] = (plus.positions[joint] - minus.positions[joint]) / (2.0 * size);
+                slopes[(joints.len() + k, column)] = (plus.rates[joint] - minus.rates[joint]) / (2.0 * size);
+            }
+        }
+        let mut cursor = self.cursor;
+        let disturbance = self.disturbance.clone();
+        let scratch = (&mut self.workspace, &mut cursor);
+        drive.run(&mut self.tree, &mut self.state, span, &disturbance, scratch);
+        self.cursor = cursor;
+        self.time_s = to_s;
+        self.grow(&joints, &coordinates, &slopes, span[1] - span[0]);
+        self.fade(span[1] - span[0]);
+    }
+
+    /// Joints between the world and what is held, and those with a rate.
+    pub(super) fn moving_joints(&self) -> Vec<usize> {
+        let driven = self.held.map(|held| self.mechanism.chain(held.body)).unwrap_or_default();
+        let n = self.mechanism.joints.len();
+        (0..n).filter(|joint| driven.contains(joint) || self.state.rates[*joint] != 0.0).collect()
+    }
+
+    /// Places of positions, rates, disturbances and numbers of some joints.
+    pub(super) fn coordinates_of(&self, joints: &[usize]) -> Vec<usize> {
+        let n = self.mechanism.joints.len();
+        let of_numbers = self.mechanism.active.iter().enumerate().filter(|(_, number)| joints.contains(&number.joint));
+        let states = [0, n, 2 * n + 3].into_iter().flat_map(|first| joints.iter().map(move |joint| first + joint));
+        states.chain(of_numbers.map(|(i, _)| 3 * n + 3 + i)).collect()
+    }
+
+    /// How far a coordinate may be moved in one linearization.
+    pub(super) fn largest_step(&self, at: usize) -> f64 {
+        let n = self.mechanism.joints.len();
+        if at < 2 * n {
+            let reach = self.mechanism.reach(at % n);
+            if at < n { 0.02 / reach } else { 0.3 / reach }
+        } else if at < 3 * n + 3 {
+            f64::INFINITY
+        } else {
+            NUMBER_DEVIATION.1
+        }
+    }
+
+    /// The state after a span if one coordinate were other by `change`; `None` if no tree is so.
+    fn run_changed(&self, at: usize, change: f64, drive: &Drive<'_>, span: [f64; 2]) -> Option<State<f64>> {
+        let Start { mut tree, mut state, disturbance, .. } = self.start(&[(at, change)])?;
+        let mut workspace = Workspace::new(&tree);
+        let mut cursor = 0;
+        drive.run(&mut tree, &mut state, span, &disturbance, (&mut workspace, &mut cursor));
+        state.positions.iter().chain(&state.rates).all(|x| x.is_finite()).then_some(state)
+    }
+
+    /// What a simulation starts from, some coordinates changed; `None` if no tree is so.
+    pub(super) fn start(&self, changes: &[(usize, f64)]) -> Option<Start> {
+        let n = self.mechanism.joints.len();
+        let (mut positions, mut rates) = (self.state.positions.clone(), self.state.rates.clone());
+        let mut disturbance = self.disturbance.clone();
+        let mut held = self.held;
+        let mut numbers: Option<DVector<f64>> = None;
+        for &(at, change) in changes {
+            if at < n {
+                positions[at] += change;
+            } else if at < 2 * n {
+                rates[at - n] += change;
+            } else if at < 2 * n + 3 {
+                held.iter_mut().for_each(|held| held.point[at - 2 * n] += change);
+            } else if at < 3 * n + 3 {
+                disturbance[at - 2 * n - 3] += change;
+            } else {
+                let place = self.mechanism.active[at - 3 * n - 3].place;
+                numbers.get_or_insert_with(|| self.numbers.clone())[place] += change;
+            }
+        }
+        let tree = match numbers {
+            Some(numbers) => self.mechanism.trees.tree(&numbers)?,
+            None => self.tree.clone(),
+        };
+        Some(Start { tree, state: State::new(positions, rates), disturbance, held })
+    }
+
+    /// The covariance over a span \[s\]: P ← F P Fᵀ + Q.
+    fn grow(&mut self, joints: &[usize], coordinates: &[usize], slopes: &DMatrix<f64>, span: f64) {
+        let n = self.mechanism.joints.len();
+        let rows: Vec<usize> = joints.iter().copied().chain(joints.iter().map(|joint| n + joint)).collect();
+        let moved = slopes * self.covariance.select_rows(coordinates);
+        for (k, &row) in rows.iter().enumerate() {
+            self.covariance.row_mut(row).copy_from(&moved.row(k));
+        }
+        let moved = self.covariance.select_columns(coordinates) * slopes.transpose();
+        for (k, &row) in rows.iter().enumerate() {
+            self.covariance.column_mut(row).copy_from(&moved.column(k));
+        }
         let driven = self.held.map(|held| self.point_slopes(&held));
-        for joint in 0..n {
+        for &joint in joints {
             let stuck = self.state.rates[joint] == 0.0;
-            let damping = self.mechanism.tree.bodies()[joint].parameters.damping;
-            let decay =
-                if stuck { (-span / STUCK_MEMORY).exp() } else { 1.0 / (1.0 + span * damping / self.inertias[joint]) };
-            // (q, q̇) ← (q + h q̇, α q̇)
-            let shift = self.covariance.row(n + joint) * span;
-            let mut row = self.covariance.row_mut(joint);
-            row += shift;
-            let shift = self.covariance.column(n + joint) * span;
-            let mut column = self.covariance.column_mut(joint);
-            column += shift;
-            self.covariance.row_mut(n + joint).scale_mut(decay);
-            self.covariance.column_mut(n + joint).scale_mut(decay);
+            if stuck {
+                let decay = (-span / STUCK_MEMORY).exp();
+                self.covariance.row_mut(n + joint).scale_mut(decay);
+                self.covariance.column_mut(n + joint).scale_mut(decay);
+            }
             let lever = match &driven {
                 Some(slopes) => slopes.column(joint).norm_squared(),
                 None if stuck => 0.0,
-                None => reach(&self.mechanism, joint).powi(2),
+                None => self.mechanism.reach(joint).powi(2),
             };
             let density =
                 FORCE_DENSITY * self.mechanism.noise_scale * self.unease * lever / self.inertias[joint].powi(2);
@@ -286,6 +432,25 @@ impl Filter {
             self.covariance[(joint, joint)] += density * span.powi(3) / 3.0;
             self.covariance[(n + joint, joint)] += density * span.powi(2) / 2.0;
             self.covariance[(joint, n + joint)] += density * span.powi(2) / 2.0;
+        }
+        for (i, number) in self.mechanism.active.iter().enumerate() {
+            if joints.contains(&number.joint) {
+                self.covariance[(3 * n + 3 + i, 3 * n + 3 + i)] += NUMBER_DRIFT.powi(2) * span;
+            }
+        }
+    }
+
+    /// Disturbances over a span \[s\]: u ← α u, with the noise that keeps their spread.
+    fn fade(&mut self, span: f64) {
+        let n = self.mechanism.joints.len();
+        let faded = (-span / DISTURBANCE_MEMORY).exp();
+        for joint in 0..n {
+            let at = 2 * n + 3 + joint;
+            self.disturbance[joint] *= faded;
+            self.covariance.row_mut(at).scale_mut(faded);
+            self.covariance.column_mut(at).scale_mut(faded);
+            let stationary = (DISTURBANCE * self.tree.bodies()[joint].parameters.friction).powi(2) * self.unease;
+            self.covariance[(at, at)] += stationary * (1.0 - faded * faded);
         }
     }
 
@@ -324,7 +489,7 @@ impl Filter {
         let n = self.mechanism.joints.len();
         let displacement = self.mechanism.tree.displacements(&self.state.positions)[held.body];
         let innovation = tool_in_world - self.mechanism.tool_offset - displacement.transform_point(&held.point);
-        let mut jacobian = DMatrix::zeros(3, 2 * n + 3);
+        let mut jacobian = DMatrix::zeros(3, self.covariance.nrows());
         jacobian.view_mut((0, 0), (3, n)).copy_from(&self.point_slopes(&held));
         jacobian.view_mut((0, 2 * n), (3, 3)).copy_from(&displacement.rotation);
         let noise = Matrix3::identity() * (sigma_m * sigma_m + HELD_DEVIATION.powi(2));
@@ -379,7 +544,7 @@ impl Filter {
         let to_part = Pose::from_translation(-center) * measurement.displacement.inverse();
         let residual = (to_part * displacement * Pose::from_translation(center)).log();
         let screws = mechanism.tree.screws(&self.state.positions);
-        let mut jacobian = DMatrix::zeros(6, 2 * n + 3);
+        let mut jacobian = DMatrix::zeros(6, self.covariance.nrows());
         for joint in mechanism.chain(body) {
             let Spatial { angular, linear } = screws[joint];
             let screw = Vector6::new(angular.x, angular.y, angular.z, linear.x, linear.y, linear.z);
@@ -397,7 +562,7 @@ impl Filter {
         let innovation = SVector::<f64, 6>::from(-residual);
         if innovation.dot(&(inverse * innovation)) > GATE {
             for joint in mechanism.chain(body) {
-                let reach = reach(&mechanism, joint);
+                let reach = mechanism.reach(joint);
                 self.covariance[(joint, joint)] += (0.01 / reach).powi(2);
                 self.covariance[(n + joint, n + joint)] += (0.05 / reach).powi(2);
             }
@@ -411,49 +576,54 @@ impl Filter {
         self.correct(&jacobian, &inverse, &DVector::from_column_slice(innovation.as_slice()));
     }
 
-    /// x ← x + P Hᵀ S⁻¹ z, P ← P − P Hᵀ S⁻¹ H P.
+    /// x ← x + K z, K = P Hᵀ S⁻¹; where the numbers are only considered their rows of K are zero
+    /// (Schmidt 1966), so P ← P − K H P − (K H P)ᵀ + K S Kᵀ.
     fn correct(&mut self, jacobian: &DMatrix<f64>, inverse: &DMatrix<f64>, innovation: &DVector<f64>) {
         let n = self.mechanism.joints.len();
         let cross = &self.covariance * jacobian.transpose();
-        let gain = &cross * inverse;
+        let mut gain = &cross * inverse;
+        let numbers = 3 * n + 3;
+        if !self.adapts {
+            gain.rows_mut(numbers, self.mechanism.active.len()).fill(0.0);
+        }
         let change = &gain * innovation;
+        if !change.iter().all(|x| x.is_finite()) {
+            return;
+        }
         for joint in 0..n {
             self.state.positions[joint] += change[joint];
             self.state.rates[joint] += change[n + joint];
+            self.disturbance[joint] += change[2 * n + 3 + joint];
         }
+        self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
         if let Some(held) = &mut self.held {
             held.point += Vector3::new(change[2 * n], change[2 * n + 1], change[2 * n + 2]);
         }
-        self.covariance -= &gain * cross.transpose();
+        let Some(spread) = inverse.clone().try_inverse() else { return };
+        let shown = &gain * cross.transpose();
+        self.covariance += &gain * spread * gain.transpose() - &shown - shown.transpose();
         self.covariance = (&self.covariance + self.covariance.transpose()) * 0.5;
         for i in 0..self.covariance.nrows() {
             self.covariance[(i, i)] = self.covariance[(i, i)].max(0.0);
         }
+        self.change_numbers(&change);
+        for (seen, q) in self.explored.iter_mut().zip(&self.state.positions) {
+            *seen = [seen[0].min(*q), seen[1].max(*q)];
+        }
     }
-}
 
-/// Puts resting joints back.
-pub(super) fn keep(resting: &[(usize, f64)], state: &mut State<f64>) {
-    for &(joint, position) in resting {
-        state.positions[joint] = position;
-        state.rates[joint] = 0.0;
+    fn change_numbers(&mut self, change: &DVector<f64>) {
+        let first = 3 * self.mechanism.joints.len() + 3;
+        let mut numbers = self.numbers.clone();
+        for (i, number) in self.mechanism.active.iter().enumerate() {
+            numbers[number.place] += change[first + i].clamp(-NUMBER_DEVIATION.1, NUMBER_DEVIATION.1);
+        }
+        if numbers == self.numbers {
+            return;
+        }
+        if let Some(tree) = self.mechanism.trees.tree(&numbers) {
+            self.numbers = numbers;
+            self.tree = tree;
+        }
     }
-}
-
-/// Motion of a part's points by its joint's unit: 1 on a slide, metres on a hinge.
-pub(super) fn reach(mechanism: &TrackedMechanism, joint: usize) -> f64 {
-    let KinematicReach { distance, radius } = distance_of(mechanism, joint);
-    distance.map_or(1.0, |distance| distance.hypot(radius).max(0.05))
-}
-
-struct KinematicReach {
-    distance: Option<f64>,
-    radius: f64,
-}
-
-fn distance_of(mechanism: &TrackedMechanism, joint: usize) -> KinematicReach {
-    let kinematic = &mechanism.joints[joint];
-    let revolute = kinematic.joint_type == crate::mechanism::JointType::Revolute;
-    let across = skew(&kinematic.axis.direction) * (kinematic.center - kinematic.axis.point);
-    KinematicReach { distance: revolute.then(|| across.norm()), radius: kinematic.radius }
 }

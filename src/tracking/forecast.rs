@@ -1,26 +1,28 @@
 //! Prediction: the filtered state, simulated on under the wrench to come.
 //!
-//! cov = Σ Δ Δᵀ over the directions in which state and parameters may be wrong, each simulated one
-//! standard deviation away, plus the axes', the unmodelled force's and a floor.
+//! cov = Σ Δ Δᵀ over the directions in which state, held point, disturbance and numbers may be wrong
+//! together, each simulated one standard deviation to both sides, plus the axes' and the unmodelled
+//! force's. Beyond where a joint was ever seen an unknown stop may wait: at distance X, exponential with
+//! mean L, so that a way Δ beyond becomes E min(Δ, X) = L (1 − e^(−Δ/L)), with its variance.
 
-use nalgebra::{DMatrix, Matrix3, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 
-use super::filter::{FORCE_DENSITY, Filter, STEP, keep, reach};
+use super::filter::{FORCE_DENSITY, Filter, STEP, Start};
 use super::mechanism::TrackedMechanism;
+use super::simulation::Drive;
 use crate::math::{Pose, Screw};
-use crate::mechanism::{State, Step, Tree, Workspace, WrenchPoint, WrenchSample, WrenchTrack, step};
+use crate::mechanism::{Workspace, WrenchSample};
 use crate::model::{Axis, KinematicJoint};
 use crate::types::Label;
 
-/// Standard deviation that nothing lowers: of a part where it is \[m\] by joint of its chain, and by the
-/// way it is to go. Fits and filters are off by this on ../shared/bags beyond what they say.
-const FLOOR: f64 = 0.0012;
-const FLOOR_BY_WAY: f64 = 0.05;
 /// Steps of the simulations that differ from the prediction \[s\].
 const COARSE_STEP: f64 = 0.008;
-
-/// The filter at the time that predictions start from.
-pub type Snapshot = Filter;
+/// Mean distance to a stop beyond what was seen of a joint \[m\] ...
+const STOP_BEYOND: f64 = 0.25;
+/// ... and the chance that where it was first seen is itself a stop: things are mostly found closed.
+const FOUND_CLOSED: f64 = 0.5;
+/// Nothing predicted speeds up by more than this \[m/s\].
+const FASTEST: f64 = 1.5;
 
 /// One part at one horizon.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -35,6 +37,9 @@ pub struct Forecast {
     pub covariance_m2: Matrix3<f64>,
 }
 
+/// Joint positions by time, the first at the filter's own.
+type Path = Vec<Vec<f64>>;
+
 impl Filter {
     /// Every jointed part at `horizons_s` after the filter's time, ascending, under the wrenches read.
     pub fn forecast(&self, horizons_s: &[f64], samples: &[WrenchSample]) -> Vec<Forecast> {
@@ -44,110 +49,150 @@ impl Filter {
         let first = samples.partition_point(|s| s.stamp_s < self.time_s - 0.05);
         let last = times_s.last().map_or(0, |end| samples.partition_point(|s| s.stamp_s <= end + 1e-9));
         let samples = &samples[first..last.max(first)];
-        let resting = self.resting();
-        let simulate = |tree: &Tree<f64>, state: &State<f64>, step_s: f64| -> Option<Vec<Vec<f64>>> {
-            if self.rests() {
-                return Some(vec![state.positions.clone(); times_s.len()]);
-            }
-            let track = self.held.map(|held| WrenchTrack {
-                point: WrenchPoint::Carried(held.point),
-                ..WrenchTrack::new(held.body, samples)
-            });
-            let mut workspace = Workspace::new(tree);
-            let mut state = state.clone();
-            let mut cursor = 0;
-            let mut path = vec![state.positions.clone()];
-            for span in times_s.windows(2) {
-                let count = ((span[1] - span[0]) / step_s - 1e-6).ceil().max(1.0) as usize;
-                let length_s = (span[1] - span[0]) / count as f64;
-                for i in 0..count {
-                    let middle_s = span[0] + (i as f64 + 0.5) * length_s;
-                    let wrench = track.as_ref().map(|track| track.wrench(middle_s, &mut cursor));
-                    step(tree, &mut state, wrench.as_slice(), Step { middle_s, length_s }, &mut workspace);
-                    keep(&resting, &mut state);
-                }
-                path.push(state.positions.clone());
-            }
-            path.iter().flatten().all(|q| q.is_finite()).then_some(path)
-        };
-        let tree = &self.mechanism.tree;
         let stay = || vec![self.state.positions.clone(); times_s.len()];
-        let path = simulate(tree, &self.state, STEP).unwrap_or_else(stay);
-        // How each joint's position may be wrong, by horizon.
-        let mut errors: Vec<DMatrix<f64>> = vec![DMatrix::zeros(n, n); times_s.len()];
-        if self.rests() {
-            let own = self.covariance.view((0, 0), (n, n)).into_owned();
-            errors.iter_mut().for_each(|error| error.copy_from(&own));
-        } else {
-            let coarse = simulate(tree, &self.state, COARSE_STEP).unwrap_or_else(stay);
-            let add = |errors: &mut Vec<DMatrix<f64>>, other: Option<Vec<Vec<f64>>>| {
-                let Some(other) = other else { return };
-                for ((error, a), b) in errors.iter_mut().zip(&coarse).zip(&other) {
-                    let change = nalgebra::DVector::from_iterator(n, a.iter().zip(b).map(|(a, b)| b - a));
-                    *error += &change * change.transpose();
-                }
-            };
-            let own = self.covariance.view((0, 0), (2 * n, 2 * n)).into_owned();
-            let eigen = own.symmetric_eigen();
-            for (value, vector) in eigen.eigenvalues.iter().zip(eigen.eigenvectors.column_iter()) {
-                let root = value.max(0.0).sqrt();
-                if root < 1e-5 {
-                    continue;
-                }
-                let mut positions = self.state.positions.clone();
-                let mut rates = self.state.rates.clone();
-                for joint in 0..n {
-                    positions[joint] += root * vector[joint];
-                    rates[joint] += root * vector[n + joint];
-                }
-                add(&mut errors, simulate(tree, &State::new(positions, rates), COARSE_STEP));
-            }
-            for joint in 0..n {
-                let moves = path
-                    .iter()
-                    .any(|positions| (positions[joint] - path[0][joint]).abs() * reach(&self.mechanism, joint) > 1e-4);
-                if moves {
-                    for varied in &self.mechanism.varied[joint] {
-                        add(&mut errors, simulate(varied, &self.state, COARSE_STEP));
-                    }
-                    for (error, time_s) in errors.iter_mut().zip(&times_s) {
-                        error[(joint, joint)] += self.unmodelled(joint, time_s - self.time_s);
-                    }
-                }
-            }
+        let mut errors: Vec<DMatrix<f64>> = vec![self.covariance.view((0, 0), (n, n)).into_owned(); times_s.len()];
+        let mut path = stay();
+        if !self.rests() {
+            path = self.simulate(&[], &times_s, samples, STEP).unwrap_or_else(stay);
+            errors = self.spread(&path, &times_s, samples);
         }
+        let tree = &self.mechanism.tree;
         let mut forecasts = Vec::with_capacity(n * horizons_s.len());
         for horizon in 0..horizons_s.len() {
-            let positions = &path[horizon + 1];
-            let displacements = tree.displacements(positions);
+            let (positions, variances) = self.before_unknown_stops(&path[horizon + 1]);
+            for (joint, variance) in variances.iter().enumerate() {
+                errors[horizon + 1][(joint, joint)] += variance;
+            }
+            let displacements = tree.displacements(&positions);
             for (body, joint) in self.mechanism.joints.iter().enumerate() {
                 if self.mechanism.chain(body).iter().any(|&joint| self.distrusted[joint]) {
                     continue;
                 }
-                let displacement = displacements[body];
-                let way = (displacement.transform_point(&self.mechanism.centers[body])
-                    - tree.displacements(&path[0])[body].transform_point(&self.mechanism.centers[body]))
-                .norm();
-                let mut covariance = center_covariance(&self.mechanism, body, positions, &errors[horizon + 1]);
-                let floor = FLOOR * self.mechanism.chain(body).len() as f64;
-                let floor_by_way = FLOOR_BY_WAY * way;
-                covariance += Matrix3::identity() * (floor * floor);
-                let direction = displacement.transform_point(&self.mechanism.centers[body])
-                    - tree.displacements(&path[0])[body].transform_point(&self.mechanism.centers[body]);
-                if let Some(direction) = direction.try_normalize(1e-6) {
-                    covariance += direction * direction.transpose() * (floor_by_way * floor_by_way);
-                }
-                forecasts.push(Forecast { label: joint.child, horizon, displacement, covariance_m2: covariance });
+                let covariance_m2 = center_covariance(&self.mechanism, body, &positions, &errors[horizon + 1]);
+                forecasts.push(Forecast {
+                    label: joint.child,
+                    horizon,
+                    displacement: displacements[body],
+                    covariance_m2,
+                });
             }
         }
         forecasts
     }
 
+    /// The joints' path from the present state, some coordinates changed; `None` if it is not finite.
+    fn simulate(
+        &self,
+        changes: &[(usize, f64)],
+        times_s: &[f64],
+        samples: &[WrenchSample],
+        step_s: f64,
+    ) -> Option<Path> {
+        let Start { mut tree, mut state, mut disturbance, held } = self.start(changes)?;
+        let resting = self.resting();
+        let drive = Drive { held, samples, resting: &resting, step_s };
+        let mut workspace = Workspace::new(&tree);
+        let mut cursor = 0;
+        let first = self.state.positions.clone();
+        let speeds: Vec<f64> = self.state.rates.iter().map(|rate| rate.abs()).collect();
+        let mut path = vec![state.positions.clone()];
+        for span in times_s.windows(2) {
+            drive.run(&mut tree, &mut state, [span[0], span[1]], &disturbance, (&mut workspace, &mut cursor));
+            let faded = (-(span[1] - span[0]) / super::simulation::DISTURBANCE_MEMORY).exp();
+            disturbance.iter_mut().for_each(|force| *force *= faded);
+            let ahead_s = span[1] - times_s[0];
+            let bounded = (0..first.len()).map(|joint| {
+                let most = (speeds[joint] + FASTEST / self.mechanism.reach(joint)) * ahead_s;
+                state.positions[joint].clamp(first[joint] - most, first[joint] + most)
+            });
+            path.push(bounded.collect());
+        }
+        path.iter().flatten().all(|q| q.is_finite()).then_some(path)
+    }
+
+    /// How joint positions may be wrong, by time.
+    fn spread(&self, path: &Path, times_s: &[f64], samples: &[WrenchSample]) -> Vec<DMatrix<f64>> {
+        let n = self.mechanism.joints.len();
+        let mut errors: Vec<DMatrix<f64>> = vec![DMatrix::zeros(n, n); times_s.len()];
+        let moving = self.moving_joints();
+        // What rests stays as it is known.
+        for error in &mut errors {
+            for joint in (0..n).filter(|joint| !moving.contains(joint)) {
+                error[(joint, joint)] += self.covariance[(joint, joint)];
+            }
+        }
+        let mut coordinates = self.coordinates_of(&moving);
+        if self.held.is_some() {
+            coordinates.extend(2 * n..2 * n + 3);
+        }
+        coordinates.retain(|&at| self.covariance[(at, at)] > 1e-16);
+        let deviations = DVector::from_iterator(
+            coordinates.len(),
+            coordinates.iter().map(|&at| self.covariance[(at, at)].sqrt()),
+        );
+        let correlation = DMatrix::from_fn(coordinates.len(), coordinates.len(), |i, j| {
+            self.covariance[(coordinates[i], coordinates[j])] / (deviations[i] * deviations[j])
+        });
+        let eigen = correlation.symmetric_eigen();
+        for (value, vector) in eigen.eigenvalues.iter().zip(eigen.eigenvectors.column_iter()) {
+            if *value < 1e-4 {
+                continue;
+            }
+            let change = |sign: f64| -> Vec<(usize, f64)> {
+                let parts = coordinates.iter().zip(deviations.iter()).zip(vector.iter());
+                parts.map(|((&at, deviation), along)| (at, sign * value.sqrt() * deviation * along)).collect()
+            };
+            let [plus, minus] = [1.0, -1.0].map(|sign| self.simulate(&change(sign), times_s, samples, COARSE_STEP));
+            let (Some(plus), Some(minus)) = (plus, minus) else { continue };
+            for (k, error) in errors.iter_mut().enumerate() {
+                let half = DVector::from_iterator(n, plus[k].iter().zip(&minus[k]).map(|(a, b)| 0.5 * (a - b)));
+                *error += &half * half.transpose();
+            }
+        }
+        for &joint in &moving {
+            let reach = self.mechanism.reach(joint);
+            if path.iter().any(|positions| (positions[joint] - path[0][joint]).abs() * reach > 1e-4) {
+                for (error, time_s) in errors.iter_mut().zip(times_s) {
+                    error[(joint, joint)] += self.unmodelled(joint, time_s - times_s[0]);
+                }
+            }
+        }
+        errors
+    }
+
+    /// Positions with the stops that may wait beyond what was seen, and the variance that they add.
+    fn before_unknown_stops(&self, positions: &[f64]) -> (Vec<f64>, Vec<f64>) {
+        let mut expected = positions.to_vec();
+        let mut variances = vec![0.0; positions.len()];
+        for (joint, seen) in self.explored.iter().enumerate() {
+            let reach = self.mechanism.reach(joint);
+            let parameters = &self.mechanism.tree.bodies()[joint].parameters;
+            let q = positions[joint];
+            let (edge, sign, known) = if q < seen[0] {
+                (seen[0], -1.0, parameters.lower.is_some())
+            } else {
+                (seen[1], 1.0, parameters.upper.is_some())
+            };
+            let beyond = sign * (q - edge) * reach;
+            if known || beyond <= 0.0 {
+                continue;
+            }
+            let closed = if edge.abs() * reach < 0.01 { FOUND_CLOSED } else { 0.0 };
+            let ratio = beyond / STOP_BEYOND;
+            let mean = (1.0 - closed) * STOP_BEYOND * (1.0 - (-ratio).exp());
+            let square = (1.0 - closed) * 2.0 * STOP_BEYOND.powi(2) * (1.0 - (-ratio).exp() * (1.0 + ratio));
+            expected[joint] = edge + sign * mean / reach;
+            variances[joint] = (square - mean * mean).max(0.0) / (reach * reach);
+        }
+        (expected, variances)
+    }
+
     /// Variance of a joint's position by the unmodelled force over a span: ∫∫ of white acceleration.
     fn unmodelled(&self, joint: usize, span_s: f64) -> f64 {
         let inertia = self.inertia(joint);
-        let density = FORCE_DENSITY * self.mechanism.noise_scale * self.unease * reach(&self.mechanism, joint).powi(2)
-            / inertia.powi(2);
+        let density =
+            FORCE_DENSITY * self.mechanism.noise_scale * self.unease * self.mechanism.reach(joint).powi(2)
+                / inertia.powi(2);
         density * span_s.powi(3) / 3.0
     }
 }

@@ -1,27 +1,82 @@
 //! The likeliest tree with its posterior, as the filter and the prediction need it.
 
 use std::collections::BTreeMap;
+use std::fmt;
+use std::sync::Arc;
 
-use nalgebra::{DMatrix, Vector3};
+use nalgebra::{DMatrix, DVector, Vector3};
 
-use crate::mechanism::Tree;
+use crate::math::skew;
+use crate::mechanism::effects::{AttachedEffect, EffectKind};
+use crate::mechanism::{JointType, Tree};
 use crate::model::{DynamicsLearner, KinematicFit, KinematicJoint};
 use crate::types::Label;
+
+/// A number of the dynamics that the filter may move.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ActiveNumber {
+    /// Whose joint it is of.
+    pub joint: usize,
+    /// Its place among all numbers.
+    pub place: usize,
+}
+
+/// Trees by their dynamic numbers.
+#[derive(Clone)]
+pub struct TreeFamily(Arc<dyn Fn(&DVector<f64>) -> Option<Tree<f64>> + Send + Sync>);
+
+impl TreeFamily {
+    /// The trees that `tree` makes.
+    pub fn new(tree: impl Fn(&DVector<f64>) -> Option<Tree<f64>> + Send + Sync + 'static) -> Self {
+        Self(Arc::new(tree))
+    }
+
+    /// The tree of these numbers, each joint with a disturbance of zero; see [`set_disturbance`].
+    pub(super) fn tree(&self, numbers: &DVector<f64>) -> Option<Tree<f64>> {
+        let mut tree = (self.0)(numbers)?;
+        for body in 0..tree.body_count() {
+            tree.parameters_mut(body).effects.push(AttachedEffect::new(EffectKind::GravityOffset, &[0.0]));
+        }
+        Some(tree)
+    }
+}
+
+/// Sets the unexplained force on each joint \[N or N·m\], of a tree of a [`TreeFamily`].
+pub(super) fn set_disturbance(tree: &mut Tree<f64>, forces: &[f64]) {
+    for (body, force) in forces.iter().enumerate() {
+        if let Some(effect) = tree.parameters_mut(body).effects.last_mut() {
+            effect.parameters[0] = *force;
+        }
+    }
+}
+
+impl fmt::Debug for TreeFamily {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("TreeFamily")
+    }
+}
 
 /// The joints of the likeliest tree with what is believed of them.
 #[derive(Clone, Debug)]
 pub struct TrackedMechanism {
     /// Parents first; body k of the tree is the child of joint k.
     pub joints: Vec<KinematicJoint>,
+    /// The trees by their numbers.
+    pub trees: TreeFamily,
+    /// The posterior's mean of all numbers.
+    pub numbers: DVector<f64>,
+    /// Those that the equations of motion hold ...
+    pub active: Vec<ActiveNumber>,
+    /// ... and their covariance.
+    pub covariance: DMatrix<f64>,
     /// The tree at the posterior's mean.
     pub tree: Tree<f64>,
-    /// Trees one standard deviation away from it, by joint: directions whose outer products add up to
-    /// the covariance of that joint's damping, friction and inertia.
-    pub varied: Vec<Vec<Tree<f64>>>,
     /// Root of the covariance of each joint's axis: two directions \[rad\], then two positions \[m\].
     pub axis_roots: Vec<DMatrix<f64>>,
     /// Centre of mass of each child at the reference configuration \[m\].
     pub centers: Vec<Vector3<f64>>,
+    /// Least and greatest position that each joint was seen at \[m or rad\].
+    pub explored: Vec<[f64; 2]>,
     /// What the reported tool position is away from the contact \[m\], world axes.
     pub tool_offset: Vector3<f64>,
     /// Process noise in units of what the wrench sensor explains.
@@ -37,16 +92,16 @@ impl TrackedMechanism {
             posterior.parts.iter().map(|part| (part.label, part.com_in_world)).collect();
         let centers: Vec<Vector3<f64>> =
             fit.joints.iter().map(|joint| centers.get(&joint.child).copied()).collect::<Option<_>>()?;
-        let tree = dynamics.tree_at(&posterior.mean)?;
+        let trees = TreeFamily::new(dynamics.trees());
+        let tree = trees.tree(&posterior.mean)?;
         if tree.body_count() != fit.joints.len() {
             return None;
         }
-        let varied = (0..fit.joints.len())
-            .map(|joint| {
-                let directions = dynamics.force_directions(joint, &posterior);
-                directions.iter().filter_map(|direction| dynamics.tree_at(&(&posterior.mean + direction))).collect()
-            })
-            .collect();
+        let active: Vec<ActiveNumber> =
+            dynamics.active_numbers().into_iter().map(|(joint, place)| ActiveNumber { joint, place }).collect();
+        let covariance = DMatrix::from_fn(active.len(), active.len(), |i, j| {
+            posterior.covariance[(active[i].place, active[j].place)]
+        });
         let axis_roots = (0..fit.joints.len())
             .map(|joint| {
                 let (start, count) = (fit.axis_offset(joint), fit.joints[joint].axis_parameters());
@@ -54,15 +109,35 @@ impl TrackedMechanism {
                 block.cholesky().map_or_else(|| DMatrix::zeros(count, count), |root| root.unpack())
             })
             .collect();
+        let explored = (0..fit.joints.len())
+            .map(|joint| {
+                let seen = fit.positions.iter().flat_map(|window| window.get(joint).into_iter().flatten());
+                seen.fold([0.0, 0.0], |[low, high]: [f64; 2], &q| [low.min(q), high.max(q)])
+            })
+            .collect();
         Some(Self {
             joints: fit.joints.clone(),
+            trees,
+            numbers: posterior.mean,
+            active,
+            covariance,
             tree,
-            varied,
             axis_roots,
             centers,
+            explored,
             tool_offset: fit.tool_offset,
             noise_scale: noise_scale.max(1.0),
         })
+    }
+
+    /// The same with no more than the declared physics; `None` if that makes no tree.
+    pub fn without_effects(&self) -> Option<Self> {
+        let mut bodies = self.tree.bodies().to_vec();
+        bodies.iter_mut().for_each(|body| {
+            body.parameters.effects.clear();
+            body.parameters.tables.clear();
+        });
+        Some(Self { tree: Tree::new(bodies, self.tree.gravity()).ok()?, ..self.clone() })
     }
 
     /// The body of a part.
@@ -73,5 +148,17 @@ impl TrackedMechanism {
     /// The joints from a body to the world, the body's own first.
     pub fn chain(&self, body: usize) -> Vec<usize> {
         std::iter::successors(Some(body), |&joint| self.joints[joint].parent).collect()
+    }
+
+    /// Motion of a part's points by its joint's unit: 1 on a slide, metres on a hinge.
+    pub fn reach(&self, joint: usize) -> f64 {
+        let joint = &self.joints[joint];
+        match joint.joint_type {
+            JointType::Revolute => {
+                let across = skew(&joint.axis.direction) * (joint.center - joint.axis.point);
+                across.norm().hypot(joint.radius).max(0.05)
+            }
+            _ => 1.0,
+        }
     }
 }

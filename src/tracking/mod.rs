@@ -8,10 +8,13 @@ mod filter;
 mod forecast;
 mod free;
 mod mechanism;
+mod score;
+mod simulation;
 #[cfg(test)]
 mod tests;
 
 pub use filter::{Filter, Held};
-pub use forecast::{Forecast, Snapshot};
+pub use forecast::Forecast;
 pub use free::FreePart;
-pub use mechanism::TrackedMechanism;
+pub use mechanism::{ActiveNumber, TrackedMechanism, TreeFamily};
+pub use score::{MeasuredPath, ResidualSum};

@@ -3,9 +3,9 @@
 
 use std::sync::Arc;
 
-use nalgebra::{DMatrix, Vector3};
+use nalgebra::{DMatrix, DVector, Vector3};
 
-use super::{Filter, TrackedMechanism};
+use super::{ActiveNumber, Filter, TrackedMechanism, TreeFamily};
 use crate::math::Pose;
 use crate::mechanism::{
     Body, JointParameters, JointType, State, Tree, WrenchPoint, WrenchSample, WrenchTrack, rollout,
@@ -16,9 +16,7 @@ use crate::types::Label;
 const CONTACT: Vector3<f64> = Vector3::new(0.5, 0.0, 0.2);
 
 /// A drawer along x of 3 kg.
-fn drawer(damping: f64) -> TrackedMechanism {
-    let parameters = JointParameters::new(damping, 3.0);
-    let body = Body { parameters, ..Body::prismatic(None, &Vector3::x(), 3.0) };
+pub(super) fn drawer(damping: f64) -> TrackedMechanism {
     let axis = Axis { direction: Vector3::x(), point: Vector3::zeros() };
     let joint = KinematicJoint {
         parent: None,
@@ -29,10 +27,21 @@ fn drawer(damping: f64) -> TrackedMechanism {
         radius: 0.2,
         suggested: None,
     };
+    // Its numbers are ln damping and ln friction.
+    let trees = TreeFamily::new(|numbers| {
+        let parameters = JointParameters::new(numbers[0].exp(), numbers[1].exp());
+        let body = Body { parameters, ..Body::prismatic(None, &Vector3::x(), 3.0) };
+        Tree::new(vec![body], Vector3::new(0.0, 0.0, -9.81)).ok()
+    });
+    let numbers = DVector::from_vec(vec![damping.ln(), 3f64.ln()]);
     TrackedMechanism {
         joints: vec![joint],
-        tree: Tree::new(vec![body], Vector3::new(0.0, 0.0, -9.81)).unwrap(),
-        varied: vec![Vec::new()],
+        tree: trees.tree(&numbers).unwrap(),
+        trees,
+        numbers,
+        active: (0..2).map(|place| ActiveNumber { joint: 0, place }).collect(),
+        covariance: DMatrix::identity(2, 2) * 0.05 * 0.05,
+        explored: vec![[0.0, 1.0]],
         axis_roots: vec![DMatrix::zeros(2, 2)],
         centers: vec![Vector3::zeros()],
         tool_offset: Vector3::new(0.002, -0.001, 0.0),
@@ -41,7 +50,7 @@ fn drawer(damping: f64) -> TrackedMechanism {
 }
 
 /// Readings at 125 Hz of a pull that varies, with no noise: a test needs no luck.
-fn readings() -> Vec<WrenchSample> {
+pub(super) fn readings() -> Vec<WrenchSample> {
     (0..250)
         .map(|i| {
             let stamp_s = f64::from(i) * 0.008;
@@ -56,7 +65,7 @@ fn readings() -> Vec<WrenchSample> {
         .collect()
 }
 
-fn truth(tree: &Tree<f64>, samples: &[WrenchSample], times_s: &[f64]) -> Vec<(f64, f64)> {
+pub(super) fn truth(tree: &Tree<f64>, samples: &[WrenchSample], times_s: &[f64]) -> Vec<(f64, f64)> {
     let track = WrenchTrack { point: WrenchPoint::Carried(CONTACT), ..WrenchTrack::new(0, samples) };
     let path = rollout(tree, &State::at_rest(1), &[track], times_s, 0.001).unwrap();
     (0..times_s.len()).map(|i| (path.positions(i)[0], path.rates(i)[0])).collect()

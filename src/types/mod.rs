@@ -1,6 +1,7 @@
 //! What flows between the layers: stamps, labels, clouds, wrenches, poses with information.
 
 pub mod finite;
+pub mod pairs;
 pub mod posterior;
 
 use std::fmt;
@@ -61,7 +62,7 @@ pub struct SegmentedCloud {
 }
 
 /// What the tool does to the object at one instant, in world.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct AppliedWrench {
     /// Time of the reading.
     pub stamp: Stamp,

@@ -408,7 +408,9 @@ impl Record {
             tool_offset: Vector3::zeros(),
             covariance: DMatrix::identity(parameters + 3, parameters + 3) * 1e-10,
             cost: 0.0,
-            moves: vec![100; self.joints.len()],
+            moves: vec![vec![100; windows]; self.joints.len()],
+            window_costs: vec![0.0; windows],
+            window_information: vec![0.0; windows],
             converged: true,
         }
     }

@@ -1,10 +1,12 @@
 //! Parameters of effects: dimension, unit, and how a standard normal θ becomes a physical value.
 
+use serde::{Deserialize, Serialize};
+
 use super::super::joint::JointType;
 use crate::math::Real;
 
 /// The sizes that make priors dimensionless, taken from the data or the setting.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Scales {
     /// Of the generalized force on the joint \[N or N·m\].
     pub force: f64,

@@ -6,13 +6,14 @@
 //! noise does to the joints, times κ ≥ 1 for what the model misses. The innovations are then white
 //! with covariance S, and −½ Σ (eᵀ S⁻¹ e + ln |S|) is the log likelihood (Ljung, "System
 //! Identification", 1999, section 7.4; Kristensen, Madsen, Jørgensen, Automatica 40, 2004).
-//! Derivatives are for fixed gains, by forward mode for one joint.
+//! The state holds the contact point's constant error beside (q, q̇). Derivatives are for fixed gains,
+//! by forward mode for one joint.
 
 use nalgebra::{DMatrix, DVector};
 use num_dual::DualSVec64;
 
 use super::layout::{Mechanism, SensorError};
-use super::track::JointTrack;
+use super::track::{CONTACT_DEVIATION, JointTrack, Observation};
 use crate::inference::Failure;
 use crate::math::Real;
 use crate::mechanism::{State, Tree, WrenchPoint, WrenchSample, WrenchTrack, rollout};
@@ -30,6 +31,8 @@ const FRICTION_SPAN_S: f64 = 0.02;
 /// Standard deviation of the first position \[m or rad\] and rate \[m/s or rad/s\].
 const FIRST_POSITION: f64 = 0.02;
 const FIRST_RATE: f64 = 0.1;
+/// Components of the contact point's error, after (q, q̇).
+const CONTACT: usize = 3;
 
 /// The model of one window.
 #[derive(Clone, Debug)]
@@ -51,7 +54,7 @@ pub struct WindowModel<'a> {
 /// Gain and whitening of one observation.
 #[derive(Clone, Debug)]
 pub struct Gain {
-    /// K, of (q, q̇) by innovation.
+    /// K, of (q, q̇) and the contact point's error by innovation.
     gain: DMatrix<f64>,
     /// L with S = L Lᵀ.
     deviation: DMatrix<f64>,
@@ -124,23 +127,30 @@ impl WindowModel<'_> {
             return Err(Failure::NoInformation);
         }
         let mut state = self.first_state();
-        let mut slopes = DMatrix::zeros(2 * n, p);
+        let size = 2 * n + CONTACT;
+        let mut slopes = DMatrix::zeros(size, p);
         let mut covariance = self.first_covariance();
         let mut result = Innovations::default();
         for (k, observation) in observations.iter().enumerate() {
             if k > 0 {
                 let span = [observations[k - 1].time_s, observation.time_s];
-                let (next, derivatives) = self.advance_with_slopes(&slopes_by, &state, span, p)?;
-                state = next;
-                let transition = derivatives.columns(p, 2 * n);
-                slopes = transition * slopes + derivatives.columns(0, p);
-                covariance = transition * covariance * transition.transpose();
-                covariance += noise.over(span, &self.all_positions(state.as_slice()), self)?;
+                let moved = state.rows(0, 2 * n).into_owned();
+                let (next, derivatives) = self.advance_with_slopes(&slopes_by, &moved, span, p)?;
+                state.rows_mut(0, 2 * n).copy_from(&next);
+                let mut transition = DMatrix::identity(size, size);
+                transition.view_mut((0, 0), (2 * n, 2 * n)).copy_from(&derivatives.columns(p, 2 * n));
+                slopes = &transition * slopes;
+                let mut own = slopes.rows_mut(0, 2 * n);
+                own += derivatives.columns(0, p);
+                covariance = &transition * covariance * transition.transpose();
+                let mut own = covariance.view_mut((0, 0), (2 * n, 2 * n));
+                own += noise.over(span, &self.all_positions(state.as_slice()), self)?;
             }
-            let innovation = &observation.value - &observation.rows * state.rows(0, n);
-            let innovation_slopes = -(&observation.rows * slopes.rows(0, n));
-            let spread = covariance.columns(0, n) * observation.rows.transpose();
-            let total = &observation.rows * spread.rows(0, n) + DMatrix::identity(n, n);
+            let rows = state_rows(observation);
+            let innovation = &observation.value - &rows * &state;
+            let innovation_slopes = -(&rows * &slopes);
+            let spread = &covariance * rows.transpose();
+            let total = &rows * &spread + DMatrix::identity(n, n);
             let cholesky = total.cholesky().ok_or(Failure::Diverged)?;
             let gain = cholesky.solve(&spread.transpose()).transpose();
             covariance -= &gain * spread.transpose();
@@ -167,25 +177,30 @@ impl WindowModel<'_> {
     /// The filter alone, step by step.
     pub(super) fn filtered(&self, x: &[f64]) -> Result<Vec<FilterStep>, Failure> {
         let n = self.moving.len();
+        let size = 2 * n + CONTACT;
         let slopes = if n > 1 { self.differences(x, &[])? } else { self.forward(x, &[])? };
         let noise = ProcessNoise::new(self, x)?;
         let mut predicted = self.first_state();
         let mut covariance = self.first_covariance();
-        let mut transition = DMatrix::identity(2 * n, 2 * n);
+        let mut transition = DMatrix::identity(size, size);
         let mut steps: Vec<FilterStep> = Vec::new();
         let mut before_s = None;
         for observation in &self.track.observations {
             if let (Some(from_s), Some(last)) = (before_s, steps.last()) {
                 let span = [from_s, observation.time_s];
-                let (next, derivatives) = self.advance_with_slopes(&slopes, &last.updated, span, 0)?;
-                predicted = next;
-                transition = derivatives.columns(0, 2 * n).into_owned();
+                let moved = last.updated.rows(0, 2 * n).into_owned();
+                let (next, derivatives) = self.advance_with_slopes(&slopes, &moved, span, 0)?;
+                predicted.copy_from(&last.updated);
+                predicted.rows_mut(0, 2 * n).copy_from(&next);
+                transition.view_mut((0, 0), (2 * n, 2 * n)).copy_from(&derivatives.columns(0, 2 * n));
                 covariance = &transition * &last.updated_covariance * transition.transpose();
-                covariance += noise.over(span, &self.all_positions(predicted.as_slice()), self)?;
+                let mut own = covariance.view_mut((0, 0), (2 * n, 2 * n));
+                own += noise.over(span, &self.all_positions(predicted.as_slice()), self)?;
             }
-            let innovation = &observation.value - &observation.rows * predicted.rows(0, n);
-            let spread = covariance.columns(0, n) * observation.rows.transpose();
-            let total = &observation.rows * spread.rows(0, n) + DMatrix::identity(n, n);
+            let rows = state_rows(observation);
+            let innovation = &observation.value - &rows * &predicted;
+            let spread = &covariance * rows.transpose();
+            let total = &rows * &spread + DMatrix::identity(n, n);
             let gain = total.cholesky().ok_or(Failure::Diverged)?.solve(&spread.transpose()).transpose();
             let updated_covariance = &covariance - &gain * spread.transpose();
             steps.push(FilterStep {
@@ -193,7 +208,7 @@ impl WindowModel<'_> {
                 updated_covariance: (&updated_covariance + updated_covariance.transpose()) * 0.5,
                 predicted: predicted.clone(),
                 // Never singular, where a joint sticks.
-                predicted_covariance: &covariance + DMatrix::identity(2 * n, 2 * n) * 1e-14,
+                predicted_covariance: &covariance + DMatrix::identity(size, size) * 1e-14,
                 transition: transition.clone(),
             });
             before_s = Some(observation.time_s);
@@ -203,11 +218,13 @@ impl WindowModel<'_> {
 
     fn first_covariance(&self) -> DMatrix<f64> {
         let n = self.moving.len();
-        DMatrix::from_fn(2 * n, 2 * n, |i, j| match (i == j, i < n) {
-            (false, _) => 0.0,
-            (true, true) => FIRST_POSITION.powi(2),
-            (true, false) => FIRST_RATE.powi(2),
-        })
+        let deviation = |i: usize| match i {
+            i if i < n => FIRST_POSITION,
+            i if i < 2 * n => FIRST_RATE,
+            _ => CONTACT_DEVIATION,
+        };
+        let size = 2 * n + CONTACT;
+        DMatrix::from_fn(size, size, |i, j| if i == j { deviation(i).powi(2) } else { 0.0 })
     }
 
     /// Whitened innovations at `x` with gains from elsewhere.
@@ -219,10 +236,10 @@ impl WindowModel<'_> {
         for (k, (observation, Gain { gain, deviation })) in self.track.observations.iter().zip(gains).enumerate() {
             if k > 0 {
                 let span = [self.track.observations[k - 1].time_s, observation.time_s];
-                let run = self.advance(&plant, state.as_slice(), span)?;
-                state = DVector::from_vec(run);
+                let run = self.advance(&plant, &state.as_slice()[..2 * n], span)?;
+                state.rows_mut(0, 2 * n).copy_from_slice(&run);
             }
-            let innovation = &observation.value - &observation.rows * state.rows(0, n);
+            let innovation = &observation.value - state_rows(observation) * &state;
             let whitened = deviation.solve_lower_triangular(&innovation).ok_or(Failure::Diverged)?;
             all.extend(whitened.iter());
             state += gain * innovation;
@@ -373,21 +390,33 @@ impl WindowModel<'_> {
         positions
     }
 
-    /// (q, q̇) at the first observation, with rates if the window opens in motion.
+    /// The state at the first observation, with rates if the window opens in motion.
     fn first_state(&self) -> DVector<f64> {
         let n = self.moving.len();
         let first = &self.track.positions[0];
         let ahead = 3.min(self.track.positions.len() - 1);
         let span_s = self.track.observations[ahead].time_s - self.track.observations[0].time_s;
-        DVector::from_fn(2 * n, |i, _| {
+        DVector::from_fn(2 * n + CONTACT, |i, _| {
             if i < n {
                 return first[i];
+            }
+            if i >= 2 * n {
+                return 0.0;
             }
             let step = self.track.positions[ahead][i - n] - first[i - n];
             // Positions of a joint at rest are equal, as the kinematic fit ties them.
             if step.abs() > 0.02 && span_s > 0.0 { step / span_s } else { 0.0 }
         })
     }
+}
+
+/// [H 0 G], what an observation sees of the state.
+fn state_rows(observation: &Observation) -> DMatrix<f64> {
+    let n = observation.rows.ncols();
+    let mut rows = DMatrix::zeros(n, 2 * n + CONTACT);
+    rows.columns_mut(0, n).copy_from(&observation.rows);
+    rows.columns_mut(2 * n, CONTACT).copy_from(&observation.contact_rows);
+    rows
 }
 
 /// The samples needed between two times.

@@ -6,9 +6,8 @@
 //! axis. The first moment itself would be linear in the equations, but its prior is not Gaussian:
 //! a mass within a factor of three times a centre within a few centimetres.
 
-use std::sync::Arc;
-
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
+use serde::{Deserialize, Serialize};
 
 use crate::geometry::HullProperties;
 use crate::inference::{Failure, Gaussian};
@@ -50,7 +49,7 @@ const LOG_FORCE_DEVIATION: f64 = 1.5;
 pub const LIMIT_DEVIATION: f64 = 0.01;
 
 /// Typical force and rate of a joint, and how far it goes, from the first window in which it moved.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct JointScales {
     /// \[N or N·m\].
     pub force: f64,
@@ -61,7 +60,7 @@ pub struct JointScales {
 }
 
 /// A named effect beyond the declared model.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct AddedEffect {
     /// Which.
     pub kind: EffectKind,
@@ -74,12 +73,12 @@ pub struct AddedEffect {
 }
 
 /// A tabulated effect: what has no name, or what names are compared with.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct AddedTable {
     /// What is tabulated over what.
     pub kind: TableKind,
     /// Arguments, ascending.
-    pub nodes: Arc<[f64]>,
+    pub nodes: Vec<f64>,
     /// Standard deviation of an entry by the prior, in the units of the entries.
     pub scale: f64,
     /// Over this distance entries are alike, in the units of the nodes.
@@ -89,7 +88,7 @@ pub struct AddedTable {
 }
 
 /// Which errors of the wrench sensor the model has.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SensorModel {
     /// A constant added to force and torque.
     pub bias: bool,
@@ -120,7 +119,7 @@ pub struct SensorError<T: Real> {
 }
 
 /// All that is fixed of one joint and its body.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct JointModel {
     /// Parent, child, type, axis.
     pub joint: KinematicJoint,
@@ -289,7 +288,7 @@ impl JointModel {
             at += entries.len();
             parameters.tables.push(AttachedTable {
                 kind: table.kind,
-                nodes: table.nodes.clone(),
+                nodes: table.nodes.as_slice().into(),
                 values: entries.iter().map(|&entry| entry * T::constant(table.scale)).collect(),
                 reversed: table.reversed,
             });
@@ -299,7 +298,7 @@ impl JointModel {
 }
 
 /// The joints with their numbers one joint after the other.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Mechanism {
     /// Parents first.
     pub joints: Vec<JointModel>,

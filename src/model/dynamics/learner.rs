@@ -31,7 +31,7 @@ const TYPICAL_RECORD_S: f64 = 4.0;
 const STOP_EVIDENCE: f64 = 4.0;
 
 /// What a block of numbers is about.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum Block {
     /// Damping, friction, inertia, stops of a part's joint.
     Dynamics(Label),
@@ -43,8 +43,17 @@ pub enum Block {
     Sensor,
 }
 
+/// What a site stands for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub enum Site {
+    /// A window that is kept, by its index: it can be learned again.
+    Window(usize),
+    /// All windows gone by in which the tool held this part, as one Gaussian.
+    Past(Option<Label>),
+}
+
 /// What learning one window gave.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct WindowInference {
     /// Linearizations spent, on this window and on older ones.
     pub steps: usize,
@@ -62,7 +71,7 @@ pub struct WindowInference {
 }
 
 /// What stays of a joint between windows.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct JointMemory {
     signature: (JointType, Option<Label>, Vec<Label>),
     /// A fit that finds the axis the other way round counts positions the other way.
@@ -76,10 +85,12 @@ pub(super) struct JointMemory {
     pub(super) friction: bool,
     pub(super) effects: Vec<AddedEffect>,
     pub(super) tables: Vec<AddedTable>,
+    /// Least and greatest position in the windows gone by \[m or rad\].
+    pub(super) reached: Option<(f64, f64)>,
 }
 
 /// What stays of a window.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub(super) struct WindowMemory {
     pub(super) contacts: Vec<Contact>,
     pub(super) noise_scale: Option<f64>,
@@ -106,11 +117,14 @@ pub(super) struct Warm {
 }
 
 /// Learns the dynamics from windows, given the kinematic fit of all of them.
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct DynamicsLearner {
     gravity: Vector3<f64>,
-    pub(super) belief: Belief<Block, usize>,
+    pub(super) belief: Belief<Block, Site>,
     pub(super) joints: BTreeMap<Label, JointMemory>,
     pub(super) windows: Vec<WindowMemory>,
+    /// Axes and offset that the sites of windows gone by are about.
+    past: BTreeMap<Option<Label>, WindowMemory>,
     pub(super) mechanism: Mechanism,
     pub(super) declared: DeclaredPhysics,
     pub(super) sensor: SensorModel,
@@ -156,6 +170,7 @@ impl DynamicsLearner {
             belief: Belief::default(),
             joints: BTreeMap::new(),
             windows: Vec::new(),
+            past: BTreeMap::new(),
             mechanism: Mechanism { joints: Vec::new(), gravity, sensor: SensorModel::default() },
             declared: DeclaredPhysics::default(),
             sensor: SensorModel::default(),
@@ -168,6 +183,11 @@ impl DynamicsLearner {
     pub fn declaring(mut self, declared: DeclaredPhysics) -> Self {
         self.declared = declared;
         self
+    }
+
+    /// Keeps a window in which no joint is known yet: it is learned with the first that follows.
+    pub fn keep_window(&mut self, contacts: &[Contact]) {
+        self.windows.push(WindowMemory { contacts: contacts.to_vec(), ..WindowMemory::default() });
     }
 
     /// Learns the newest window, and older ones again as the budget allows.
@@ -227,6 +247,7 @@ impl DynamicsLearner {
                     friction: self.declared.friction,
                     effects: Vec::new(),
                     tables: Vec::new(),
+                    reached: None,
                 };
                 self.joints.insert(joint.child, memory);
             }
@@ -251,13 +272,48 @@ impl DynamicsLearner {
         self.set_kinematic_prior(fit)
     }
 
-    fn forget(&mut self, label: Label) {
-        for block in [Block::Dynamics(label), Block::Axis(label)] {
-            for window in self.belief.drop_sites_of(&block) {
-                self.windows[window].learned = false;
+    /// Lets a window go: its site is multiplied onto those of the windows gone by that the tool held
+    /// the same part in, and is not fitted again. Later windows move up one place. `fit` is the fit that
+    /// was last learned with.
+    pub fn retire(&mut self, window: usize, fit: &KinematicFit) {
+        if window >= self.windows.len() {
+            return;
+        }
+        for (joint, path) in fit.joints.iter().zip(fit.positions.get(window).into_iter().flatten()) {
+            if let Some(memory) = self.joints.get_mut(&joint.child) {
+                let (low, high) = range(path);
+                memory.reached = Some(memory.reached.map_or((low, high), |(l, h)| (l.min(low), h.max(high))));
             }
         }
+        let memory = self.windows.remove(window);
+        if let Some(factor) = self.belief.remove(&Site::Window(window)) {
+            let label = touched_label(&memory.contacts);
+            self.belief.multiply(Site::Past(label), &factor);
+            let past = self.past.entry(label).or_default();
+            past.axes.extend(memory.axes);
+            past.tool_offset = memory.tool_offset;
+        }
+        self.belief.rename_sites(|site| match site {
+            Site::Window(later) if later > window => Site::Window(later - 1),
+            other => other,
+        });
+    }
+
+    fn forget(&mut self, label: Label) {
+        self.forget_sites(label);
         self.belief.remove_prior(&Block::Dynamics(label));
+    }
+
+    /// Forgets what windows said of a joint.
+    pub(super) fn forget_sites(&mut self, label: Label) {
+        for block in [Block::Dynamics(label), Block::Axis(label)] {
+            for site in self.belief.drop_sites_of(&block) {
+                match site {
+                    Site::Window(window) => self.windows[window].learned = false,
+                    Site::Past(label) => drop(self.past.remove(&label)),
+                }
+            }
+        }
     }
 
     /// The mechanism of the current joints, and the priors of new ones.
@@ -308,9 +364,13 @@ impl DynamicsLearner {
 
     /// Carries the sites' kinematic errors over to the new fit: old = turn · new + shift.
     fn recenter(&mut self, fit: &KinematicFit) {
-        let windows = &mut self.windows;
-        for (&window, factor) in self.belief.sites_mut() {
-            let Some(memory) = windows.get_mut(window) else {
+        let (windows, past) = (&mut self.windows, &mut self.past);
+        for (site, factor) in self.belief.sites_mut() {
+            let memory = match site {
+                Site::Window(window) => windows.get_mut(*window),
+                Site::Past(label) => past.get_mut(label),
+            };
+            let Some(memory) = memory else {
                 continue;
             };
             let size = factor.gaussian.dimension();
@@ -477,7 +537,7 @@ impl DynamicsLearner {
             }
         }
         let (factor, result, _) = fitted;
-        self.belief.replace(window, factor);
+        self.belief.replace(Site::Window(window), factor);
         let turn = self.windows.len();
         let memory = &mut self.windows[window];
         memory.learned = true;
@@ -510,10 +570,10 @@ impl DynamicsLearner {
         // The load that stood for a tenth of the contact: not a spike of noise.
         let load = quantile(self.generalized_forces(touched, fit, &track), 0.9).ok_or(Failure::NoInformation)?;
         let block = Block::Dynamics(label);
-        let (mean, covariance) = self.belief.product(Some(&window)).moments(&[block])?;
+        let (mean, covariance) = self.belief.product(Some(&Site::Window(window))).moments(&[block])?;
         let friction = super::layout::FRICTION;
         let gaussian = load_factor(load.ln(), mean[friction], covariance[(friction, friction)].sqrt(), mean.len());
-        self.belief.replace(window, Factor { blocks: vec![(block, mean.len())], gaussian });
+        self.belief.replace(Site::Window(window), Factor { blocks: vec![(block, mean.len())], gaussian });
         self.windows[window].learned = true;
         Ok(WindowInference { steps: 1, ..WindowInference::default() })
     }
@@ -529,6 +589,7 @@ impl DynamicsLearner {
             let near = if joint.joint_type == JointType::Revolute { 0.02 } else { 0.005 };
             let all: Vec<f64> = fit.positions.iter().flat_map(|w| w[k].iter().copied()).collect();
             let (low, high) = range(&all);
+            let (low, high) = memory.reached.map_or((low, high), |(l, h)| (low.min(l), high.max(h)));
             for (side, end) in [low, high].into_iter().enumerate() {
                 if memory.stops[side] {
                     continue;
@@ -566,7 +627,7 @@ impl DynamicsLearner {
         }
         let sensor = self.mechanism.offset(self.mechanism.joints.len());
         active.extend(self.mechanism.active_sensor().into_iter().map(|i| i + sensor));
-        let cavity = self.belief.product(Some(&window));
+        let cavity = self.belief.product(Some(&Site::Window(window)));
         let blocks = self.blocks();
         let conditional = given_kinematics(&cavity, &blocks)?;
         let (mean, _) = conditional.moments()?;

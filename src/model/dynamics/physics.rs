@@ -3,9 +3,9 @@
 use nalgebra::DMatrix;
 
 use super::batch::{BatchWindow, Hypothesis};
-use super::layout::{AddedEffect, JointScales, LOWER, Mechanism, SENSOR_SIZE, SIZE, UPPER};
+use super::layout::{AddedEffect, JointModel, JointScales, LOWER, Mechanism, SENSOR_SIZE, SIZE, UPPER};
 use super::learner::{
-    Block, DynamicsInput, DynamicsLearner, Warm, added_effect, extended, kinematics_of, standard_sensor, travel_of,
+    Block, DynamicsInput, DynamicsLearner, Site, Warm, added_effect, extended, kinematics_of, standard_sensor, travel_of,
 };
 use super::track::{JointTrack, joint_track};
 use crate::inference::{Failure, Gaussian};
@@ -108,9 +108,21 @@ impl DynamicsLearner {
         sensor_prior: Option<&Gaussian>,
         (fit, input): (&KinematicFit, &DynamicsInput<'_>),
     ) -> Result<(), Failure> {
+        // Windows gone by keep what they said, as long as numbers mean the same.
+        let same_sensor = (self.sensor.bias, self.sensor.delay)
+            == (hypothesis.mechanism.sensor.bias, hypothesis.mechanism.sensor.delay);
         self.sensor = hypothesis.mechanism.sensor;
         self.sensor_prior = sensor_prior.cloned();
-        let labels: Vec<Label> = hypothesis.mechanism.joints.iter().map(|m| m.joint.child).collect();
+        let changed = |model: &JointModel| {
+            self.joints.get(&model.joint.child).is_none_or(|memory| {
+                !same_sensor
+                    || memory.friction != model.friction
+                    || memory.effects != model.effects
+                    || memory.tables != model.tables
+            })
+        };
+        let labels: Vec<Label> =
+            hypothesis.mechanism.joints.iter().filter(|m| changed(m)).map(|m| m.joint.child).collect();
         for (k, model) in hypothesis.mechanism.joints.iter().enumerate() {
             if let Some(memory) = self.joints.get_mut(&model.joint.child) {
                 memory.friction = model.friction;
@@ -126,7 +138,7 @@ impl DynamicsLearner {
             }
         }
         for label in labels {
-            self.belief.drop_sites_of(&Block::Dynamics(label));
+            self.forget_sites(label);
         }
         self.rebuild(fit)?;
         for window in 0..self.windows.len() {
@@ -142,7 +154,7 @@ impl DynamicsLearner {
             let warm = Warm { x: x.to_vec(), noise_scale };
             match self.fit_window(window, fit, input, &moving, &frozen, (steps, Some(&warm))) {
                 Ok((factor, fitted, _)) => {
-                    self.belief.replace(window, factor);
+                    self.belief.replace(Site::Window(window), factor);
                     let memory = &mut self.windows[window];
                     memory.learned = true;
                     memory.noise_scale = Some(fitted.noise_scale);

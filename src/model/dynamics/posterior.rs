@@ -159,29 +159,18 @@ impl DynamicsLearner {
         Ok((here, slope.dot(&(covariance * &slope)).max(0.0).sqrt()))
     }
 
-    /// The tree of the joints of the last kinematic fit with the given numbers, laid out as
-    /// [`DynamicsPosterior::mean`]; `None` if they make none.
-    pub fn tree_at(&self, numbers: &DVector<f64>) -> Option<Tree<f64>> {
-        let axes: Vec<_> = self.mechanism.joints.iter().map(|m| m.joint.axis).collect();
-        self.mechanism.tree(numbers.as_slice(), &axes, &vec![None; axes.len()]).ok()
+    /// The trees of the joints of the last kinematic fit by their numbers, laid out as
+    /// [`DynamicsPosterior::mean`]; `None` where numbers make none.
+    pub fn trees(&self) -> impl Fn(&DVector<f64>) -> Option<Tree<f64>> + Send + Sync + 'static {
+        let mechanism = self.mechanism.clone();
+        let axes: Vec<_> = mechanism.joints.iter().map(|m| m.joint.axis).collect();
+        let frozen = vec![None; axes.len()];
+        move |numbers| mechanism.tree(numbers.as_slice(), &axes, &frozen).ok()
     }
 
-    /// Changes of all numbers by which one joint's forces may differ: the root of its damping's,
-    /// friction's and inertia's covariance, by column, the other numbers at their mean.
-    pub fn force_directions(&self, joint: usize, posterior: &DynamicsPosterior) -> Vec<DVector<f64>> {
-        let at = self.mechanism.offset(joint);
-        let places = [DAMPING, FRICTION, INERTIA].map(|entry| at + entry);
-        let block = DMatrix::from_fn(3, 3, |i, j| posterior.covariance[(places[i], places[j])]);
-        let Some(root) = block.cholesky() else { return Vec::new() };
-        root.l()
-            .column_iter()
-            .map(|column| {
-                let mut change = DVector::zeros(posterior.mean.len());
-                for (&place, value) in places.iter().zip(column.iter()) {
-                    change[place] = value.clamp(-1.0, 1.0);
-                }
-                change
-            })
-            .collect()
+    /// The numbers that the equations of motion hold: (joint, place in [`DynamicsPosterior::mean`]).
+    pub fn active_numbers(&self) -> Vec<(usize, usize)> {
+        let models = self.mechanism.joints.iter().enumerate();
+        models.flat_map(|(k, m)| m.active().into_iter().map(move |at| (k, self.mechanism.offset(k) + at))).collect()
     }
 }

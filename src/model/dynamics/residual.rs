@@ -64,7 +64,7 @@ impl WindowModel<'_> {
         let mut first = 0;
         while first + 1 < steps.len() {
             let start_s = observations[first].time_s;
-            let mut state = smoothed[first].as_slice().to_vec();
+            let mut state = smoothed[first].as_slice()[..2 * n].to_vec();
             for k in first + 1..steps.len() {
                 if observations[k].time_s > start_s + HORIZON_S {
                     break;

@@ -3,7 +3,9 @@
 //! Tool positions x in bins of 40 ms and part poses are linearized about the joint positions that
 //! explain them best: each observation is H q with unit noise. Given the axes and the tool's offset
 //! o, the contact point p follows from the track itself: the track's circle gives the lever, so that
-//! errors of axis and o cancel in it as they should.
+//! errors of axis and o cancel in it as they should. Where p is on the part only the clouds can say,
+//! and they err by their own: its error is one unknown of the window, so that the tool measures
+//! motion, and not where zero is.
 
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
 
@@ -22,6 +24,9 @@ const SHARED_DISTANCE: f64 = 0.010;
 const STUDENT_FREEDOM: f64 = 6.0;
 /// The wrench acts this long before and after the contact's frames \[s\]: half a frame.
 const CONTACT_MARGIN_S: f64 = 0.1;
+/// Standard deviation of the contact point on its part \[m\]: what the clouds' shared error leaves
+/// open; see [`crate::model::KinematicSettings`].
+pub const CONTACT_DEVIATION: f64 = 0.020;
 /// Least standard deviation of one tool position \[m\].
 const LEAST_TOOL_DEVIATION: f64 = 1e-4;
 
@@ -54,14 +59,16 @@ pub struct TrackSource<'a> {
     pub moving: &'a [usize],
 }
 
-/// H q with unit noise.
+/// H q + G e with unit noise, e the error of the contact point.
 #[derive(Clone, Debug)]
 pub struct Observation {
     /// \[s\] since time zero.
     pub time_s: f64,
     /// One column per moving joint.
     pub rows: DMatrix<f64>,
-    /// H q as measured.
+    /// G, three columns; zero for what clouds measured.
+    pub contact_rows: DMatrix<f64>,
+    /// H q + G e as measured.
     pub value: DVector<f64>,
 }
 
@@ -167,8 +174,8 @@ pub fn joint_track(source: &TrackSource<'_>, kinematics: &TrackKinematics) -> Op
     let mut observations: Vec<Observation> = Vec::with_capacity(located.len());
     let mut positions = Vec::with_capacity(located.len());
     for (time_s, located) in located {
-        if let Some((rows, value)) = located.whitened() {
-            observations.push(Observation { time_s, rows, value });
+        if let Some((rows, contact_rows, value)) = located.whitened() {
+            observations.push(Observation { time_s, rows, contact_rows, value });
             positions.push(located.position);
         }
     }
@@ -230,12 +237,14 @@ fn run_variance(run: &[(f64, Vector3<f64>)]) -> Option<f64> {
 struct Located {
     information: DMatrix<f64>,
     weighted: DVector<f64>,
+    /// By how much A · q is too large per error of the contact point.
+    contact: DMatrix<f64>,
     position: DVector<f64>,
 }
 
 impl Located {
-    /// Lᵀ q = L⁻¹ (A q) with A = L Lᵀ: smooth in what A is made of.
-    fn whitened(&self) -> Option<(DMatrix<f64>, DVector<f64>)> {
+    /// Lᵀ q + L⁻¹ C e = L⁻¹ (A q) with A = L Lᵀ: smooth in what A is made of.
+    fn whitened(&self) -> Option<(DMatrix<f64>, DMatrix<f64>, DVector<f64>)> {
         let ridge = 1e-6 * self.information.diagonal().max() + 1e-9;
         let mut matrix = self.information.clone();
         let mut right = self.weighted.clone();
@@ -248,7 +257,8 @@ impl Located {
         }
         let lower = matrix.cholesky()?.unpack();
         let value = lower.solve_lower_triangular(&right)?;
-        Some((lower.transpose(), value))
+        let contact = lower.solve_lower_triangular(&self.contact)?;
+        Some((lower.transpose(), contact, value))
     }
 }
 
@@ -310,7 +320,9 @@ fn tool_information(
             }
             if round == 3 {
                 let position = DVector::from_fn(n, |i, _| q[source.moving[i]]);
-                result.push((*time_s, Located { information, weighted, position }));
+                let rotation = displacements[touched].rotation;
+                let contact = DMatrix::from_fn(n, 3, |i, j| columns[i].dot(&rotation.column(j)) / variance);
+                result.push((*time_s, Located { information, weighted, contact, position }));
             }
         }
         point = mean_point(&positions);
@@ -333,6 +345,7 @@ fn frame_information(source: &TrackSource<'_>, kinematics: &TrackKinematics) -> 
             let mut located = Located {
                 information: DMatrix::zeros(n, n),
                 weighted: DVector::zeros(n),
+                contact: DMatrix::zeros(n, 3),
                 position: DVector::from_fn(n, |i, _| source.positions[source.moving[i]][k]),
             };
             for (j, joint) in source.joints.iter().enumerate() {

@@ -1,0 +1,186 @@
+//! The live node: the pipeline between ROS 2 topics, on ros2-client.
+//!
+//! Tasks drain the network into an inbox ([`inbox`]); one thread takes what is newest through reading
+//! and pipeline ([`stream`]); another learns windows ([`learning`]); a task sends what they say
+//! ([`publications`]). Services, parameters and the lifecycle are beside them ([`services`]).
+
+pub mod announce;
+pub mod arguments;
+pub mod diagnostics;
+pub mod health;
+pub mod inbox;
+pub mod learning;
+pub mod lifecycle;
+pub mod names;
+pub mod parameters;
+pub mod participant;
+pub mod publications;
+pub mod rosout;
+pub mod services;
+pub mod stream;
+pub mod subscriptions;
+pub mod value;
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex};
+
+use anyhow::Context as _;
+use futures::{StreamExt, pin_mut};
+use ros2_interfaces_jazzy_serde::lifecycle_msgs::msg::Transition;
+use rustdds::{GUID, StatusEvented, dds::statusevents::DomainParticipantStatusEvent};
+use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::Notify;
+use tracing::{info, warn};
+
+use arguments::RosArguments;
+use health::SharedHealth;
+use inbox::Inbox;
+use learning::Learning;
+use names::Names;
+use parameters::Parameters;
+use participant::Participant;
+use publications::Publishers;
+use services::Managed;
+use stream::{Command, Stream};
+use subscriptions::Subscriptions;
+
+use crate::io::config::InputConfig;
+
+/// The node's name unless it is remapped.
+pub const NAME: &str = "bom";
+/// Readings that wait for the stream at most: several seconds of them.
+const MOST_READINGS: usize = 20_000;
+
+/// Runs the node until it is shut down or told to stop.
+///
+/// # Errors
+/// Names or parameters that make no node, or no network.
+pub fn run(arguments: &RosArguments) -> anyhow::Result<()> {
+    let names = Names::new(NAME, arguments)?;
+    let mut parameters = Parameters::declared();
+    let unusable = parameters.start_with(&arguments.overrides, &names);
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().context("tokio")?;
+    runtime.block_on(live(&names, parameters, unusable, !arguments.rosout_disabled))
+}
+
+/// The topics of the configuration as they are on the network.
+fn resolved(input: &InputConfig, names: &Names) -> InputConfig {
+    let mut input = input.clone();
+    let resolve = |name: &mut String| *name = names.resolve(name);
+    input.clouds.iter_mut().for_each(resolve);
+    input.wrenches.iter_mut().for_each(|wrench| resolve(&mut wrench.topic));
+    [&mut input.tf, &mut input.tf_static].into_iter().for_each(resolve);
+    input.poses = names.expand(&input.poses);
+    input
+}
+
+async fn live(names: &Names, parameters: Parameters, unusable: Vec<String>, rosout: bool) -> anyhow::Result<()> {
+    let config = parameters.config().map_err(anyhow::Error::msg)?;
+    let input = resolved(&config.input, names);
+    let health = SharedHealth::new(unusable);
+    let inbox: Arc<Inbox<Command>> = Arc::new(Inbox::new(MOST_READINGS));
+    let mut participant = Participant::join(names)?;
+    if rosout {
+        tokio::spawn(rosout::send(participant.advertise_rosout()?, names.full().trim_matches('/').replace('/', ".")));
+    }
+    let publishers = Publishers::new(&mut participant, &parameters, health.clone())?;
+    let mut endpoints = publishers.names.clone();
+    let outputs = publishers.start();
+    let adopt = Arc::clone(&inbox);
+    let threads = parameters.number("worker_threads") as usize;
+    let learning =
+        Learning::start(threads, health.clone(), move |life, learned| adopt.tell(Command::Adopt(life, learned)))?;
+    let stream = Stream::new(Arc::clone(&inbox), learning, outputs.clone(), health.clone(), input.clone());
+    let thread = std::thread::Builder::new().name("stream".into()).spawn(|| stream.run()).context("the stream's thread")?;
+    let mut subscriptions =
+        Subscriptions::new(&mut participant, &parameters, &input, Arc::clone(&inbox), health.clone())?;
+    endpoints.extend(subscriptions.names.clone());
+    if parameters.is("use_sim_time") {
+        let inbox = Arc::clone(&inbox);
+        subscriptions::watch_clock(&mut participant, health.clone(), move || inbox.tell(Command::BeginAgain))?;
+    }
+    let autostart = parameters.is("autostart");
+    let ended = Arc::new(Notify::new());
+    let managed = Managed {
+        name: names.full(),
+        parameters: Arc::new(Mutex::new(parameters)),
+        input,
+        inbox: Arc::clone(&inbox),
+        outputs,
+        health: health.clone(),
+        ended: Arc::clone(&ended),
+    };
+    services::serve(&mut participant, &managed)?;
+    tokio::spawn(diagnostics::watch(managed.clone()));
+    info!("{} is there, domain {}", names.full(), participant.node.domain_id());
+    if autostart {
+        for label in ["configure", "activate"] {
+            managed.change(&Transition { id: 0, label: label.to_owned() }).map_err(anyhow::Error::msg)?;
+        }
+    }
+    let (mut interrupted, mut terminated) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    tokio::select! {
+        () = watch_network(&mut participant, &mut subscriptions, &mut endpoints, &health) => {}
+        () = ended.notified() => info!("shut down"),
+        _ = interrupted.recv() => info!("interrupted"),
+        _ = terminated.recv() => info!("terminated"),
+    }
+    inbox.tell(Command::Stop);
+    // It is at a cloud at most.
+    let _ = tokio::task::spawn_blocking(move || thread.join()).await;
+    Ok(())
+}
+
+/// What happens on the network: topics of poses that appear, and those whose QoS does not fit.
+async fn watch_network(
+    participant: &mut Participant,
+    subscriptions: &mut Subscriptions<Command>,
+    endpoints: &mut BTreeMap<GUID, String>,
+    health: &SharedHealth,
+) {
+    let listener = participant.domain_participant().status_listener();
+    let events = listener.as_async_status_stream();
+    pin_mut!(events);
+    while let Some(event) = events.next().await {
+        match event {
+            DomainParticipantStatusEvent::WriterDetected { writer } => {
+                let Some(topic) = writer.topic_name.strip_prefix("rt") else { continue };
+                if let Err(error) = subscriptions.appeared(participant, topic) {
+                    warn!("{error:#}");
+                }
+                endpoints.extend(subscriptions.names.clone());
+            }
+            DomainParticipantStatusEvent::RemoteWriterQosIncompatible {
+                local_reader, requested_qos, offered_qos, ..
+            } => {
+                if let Some(topic) = endpoints.get(&local_reader) {
+                    let line = mismatch("a publisher's QoS does not fit", &requested_qos, &offered_qos);
+                    health.lock().incompatible.insert(topic.clone(), line);
+                }
+            }
+            DomainParticipantStatusEvent::RemoteReaderQosIncompatible {
+                local_writer, requested_qos, offered_qos, ..
+            } => {
+                if let Some(topic) = endpoints.get(&local_writer) {
+                    let line = mismatch("a subscriber's QoS does not fit", &requested_qos, &offered_qos);
+                    health.lock().incompatible.insert(topic.clone(), line);
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+fn mismatch(what: &str, requested: &rustdds::QosPolicies, offered: &rustdds::QosPolicies) -> String {
+    let mut differences = Vec::new();
+    let mut compare = |name: &str, requested: String, offered: String| {
+        if requested != offered {
+            differences.push(format!("{name}: requested {requested}, offered {offered}"));
+        }
+    };
+    compare("reliability", format!("{:?}", requested.reliability()), format!("{:?}", offered.reliability()));
+    compare("durability", format!("{:?}", requested.durability()), format!("{:?}", offered.durability()));
+    compare("deadline", format!("{:?}", requested.deadline()), format!("{:?}", offered.deadline()));
+    compare("liveliness", format!("{:?}", requested.liveliness()), format!("{:?}", offered.liveliness()));
+    format!("{what}: {}", differences.join(", "))
+}

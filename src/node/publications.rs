@@ -1,0 +1,168 @@
+//! What the node says, and how it gets onto the network: everything below 100 KB, or counted.
+
+use std::collections::BTreeMap;
+use std::time::Instant;
+
+use ros2_client::Publisher;
+use ros2_interfaces_jazzy_serde::{
+    diagnostic_msgs::msg::DiagnosticArray,
+    lifecycle_msgs::msg::TransitionEvent,
+    rcl_interfaces::msg::ParameterEvent,
+    sensor_msgs::msg::JointState,
+    std_msgs::msg::String as Text,
+    tf2_msgs::msg::TFMessage,
+    visualization_msgs::msg::MarkerArray,
+};
+use serde::Serialize;
+use tokio::sync::mpsc;
+
+use super::health::{SharedHealth, now};
+use super::parameters::Parameters;
+use super::participant::{Participant, Quality};
+use crate::io::counters::Counters;
+use crate::ros::{MOST_BYTES, encoded_bytes, messages};
+
+/// Messages that wait for the network at most.
+const MOST_WAITING: usize = 256;
+
+/// One message.
+#[derive(Clone, Debug)]
+#[expect(missing_docs, reason = "each is the message that it names")]
+pub enum Publication {
+    Posterior(Box<messages::ObjectPosterior>),
+    /// With the arrival of the cloud that it is for.
+    Predicted(messages::PredictedPartPoses, Option<Instant>),
+    Criticism(messages::Criticism),
+    Markers(MarkerArray),
+    Description(Text),
+    JointStates(JointState),
+    Tf(TFMessage),
+    Diagnostics(DiagnosticArray),
+    Transition(TransitionEvent),
+    ParameterEvent(ParameterEvent),
+}
+
+/// Hands messages to the task that sends them; cheap to share.
+#[derive(Clone)]
+pub struct Outputs {
+    sender: mpsc::Sender<Publication>,
+    health: SharedHealth,
+}
+
+impl Outputs {
+    /// Hands over a message; where too many wait it is dropped and counted.
+    pub fn send(&self, publication: Publication) {
+        if self.sender.try_send(publication).is_err() {
+            Counters::add(&mut self.health.lock().unsent, "the network is behind", 1);
+        }
+    }
+}
+
+/// A publisher for each message.
+pub struct Publishers {
+    posterior: Publisher<messages::ObjectPosterior>,
+    predicted: Publisher<messages::PredictedPartPoses>,
+    criticism: Publisher<messages::Criticism>,
+    markers: Publisher<MarkerArray>,
+    description: Publisher<Text>,
+    joint_states: Publisher<JointState>,
+    tf: Publisher<TFMessage>,
+    diagnostics: Publisher<DiagnosticArray>,
+    transitions: Publisher<TransitionEvent>,
+    parameter_events: Publisher<ParameterEvent>,
+    health: SharedHealth,
+    /// Names on the network by the publisher's identity, for what is said of them.
+    pub names: BTreeMap<rustdds::GUID, String>,
+}
+
+impl Publishers {
+    /// Advertises all topics.
+    ///
+    /// # Errors
+    /// A name that is none, or DDS.
+    pub fn new(
+        participant: &mut Participant,
+        parameters: &Parameters,
+        health: SharedHealth,
+    ) -> anyhow::Result<Self> {
+        let mut names = BTreeMap::new();
+        let own = |message: &str| format!("{}/msg/{message}", messages::PACKAGE);
+        let quality = |topic: &str, latched| {
+            let (reliable, depth) = parameters.qos(topic, false);
+            Quality { reliable, latched, depth }
+        };
+        macro_rules! advertise {
+            ($name:expr, $type_name:expr, $quality:expr) => {{
+                let publisher = participant.advertise($name, &$type_name, $quality)?;
+                names.insert(publisher.guid(), participant.resolve($name));
+                publisher
+            }};
+        }
+        let listed = |topic: &str| quality(topic, false);
+        let latched = |topic: &str| quality(topic, true);
+        let fixed = |depth| Quality { reliable: true, latched: false, depth };
+        Ok(Self {
+            posterior: advertise!("~/object_posterior", own("ObjectPosterior"), latched("~/object_posterior")),
+            predicted: advertise!("~/predicted_poses", own("PredictedPartPoses"), listed("~/predicted_poses")),
+            criticism: advertise!("~/criticism", own("Criticism"), latched("~/criticism")),
+            markers: advertise!("~/markers", "visualization_msgs/msg/MarkerArray", listed("~/markers")),
+            description: advertise!("~/robot_description", "std_msgs/msg/String", latched("~/robot_description")),
+            joint_states: advertise!("~/joint_states", "sensor_msgs/msg/JointState", listed("~/joint_states")),
+            tf: advertise!("/tf", "tf2_msgs/msg/TFMessage", fixed(100)),
+            diagnostics: advertise!("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", listed("/diagnostics")),
+            transitions: advertise!("~/transition_event", "lifecycle_msgs/msg/TransitionEvent", fixed(1)),
+            parameter_events: advertise!("/parameter_events", "rcl_interfaces/msg/ParameterEvent", fixed(1000)),
+            health,
+            names,
+        })
+    }
+
+    /// Starts the task that sends; it ends when nothing can be handed over any more.
+    pub fn start(self) -> Outputs {
+        let (sender, mut waiting) = mpsc::channel(MOST_WAITING);
+        let health = self.health.clone();
+        tokio::spawn(async move {
+            while let Some(publication) = waiting.recv().await {
+                self.publish(publication).await;
+            }
+        });
+        Outputs { sender, health }
+    }
+
+    async fn publish(&self, publication: Publication) {
+        match publication {
+            Publication::Posterior(message) => self.one("object_posterior", &self.posterior, *message).await,
+            Publication::Predicted(message, arrived) => {
+                self.one("predicted_poses", &self.predicted, message).await;
+                if let Some(arrived) = arrived {
+                    self.health.lock().latency.add(now().duration_since(arrived).as_secs_f64());
+                }
+            }
+            Publication::Criticism(message) => self.one("criticism", &self.criticism, message).await,
+            Publication::Markers(message) => self.one("markers", &self.markers, message).await,
+            Publication::Description(message) => self.one("robot_description", &self.description, message).await,
+            Publication::JointStates(message) => self.one("joint_states", &self.joint_states, message).await,
+            Publication::Tf(message) => self.one("tf", &self.tf, message).await,
+            Publication::Diagnostics(message) => self.one("diagnostics", &self.diagnostics, message).await,
+            Publication::Transition(message) => self.one("transition_event", &self.transitions, message).await,
+            Publication::ParameterEvent(message) => {
+                self.one("parameter_events", &self.parameter_events, message).await;
+            }
+        }
+    }
+
+    async fn one<M: Serialize>(&self, name: &'static str, publisher: &Publisher<M>, message: M) {
+        let bytes = encoded_bytes(&message);
+        let unsent = if bytes > MOST_BYTES {
+            tracing::warn!("{name}: {bytes} bytes, at most {MOST_BYTES} get through: not sent");
+            Some("too large")
+        } else {
+            publisher.async_publish(message).await.err().map(|_| "the network refused it")
+        };
+        let mut health = self.health.lock();
+        match unsent {
+            Some(reason) => Counters::add(&mut health.unsent, reason, 1),
+            None => *health.sent.entry(name).or_default() += 1,
+        }
+    }
+}

@@ -1,0 +1,157 @@
+//! What `bom evaluate` found: a table and a JSON document.
+
+use std::fmt::Write as _;
+use std::io::Write;
+
+use serde::Serialize;
+
+use crate::io::counters::Counters;
+use crate::io::document::DocumentError;
+use crate::pipeline::{PartScore, Scores};
+use crate::types::Label;
+use crate::types::finite::check_finite;
+
+/// Name and version of the format.
+pub const SCHEMA: &str = "bom.evaluation/1";
+
+/// The whole document.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Evaluation {
+    schema: &'static str,
+    model: String,
+    bag: String,
+    /// The model has learned this very bag: its scores are not of anything new.
+    was_learned: bool,
+    horizon_s: f64,
+    windows: usize,
+    /// By the model as first declared.
+    before: Vec<Residuals>,
+    /// With what criticism added.
+    after: Vec<Residuals>,
+    counters: Counters,
+}
+
+/// Root mean squares of one part.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+struct Residuals {
+    label: Label,
+    scored_windows: usize,
+    #[serde(rename = "force_rmse_N", skip_serializing_if = "Option::is_none")]
+    force_rmse_n: Option<f64>,
+    #[serde(rename = "torque_rmse_Nm", skip_serializing_if = "Option::is_none")]
+    torque_rmse_nm: Option<f64>,
+    position_rmse_m: f64,
+    rotation_rmse_rad: f64,
+}
+
+impl Residuals {
+    fn of(label: Label, part: &PartScore, model: usize) -> Self {
+        let sum = &part.residuals[model];
+        let rms = |square: f64, count: usize| (count > 0).then(|| (square / count as f64).sqrt());
+        let force = rms(sum.force.0, sum.force.1);
+        Self {
+            label,
+            scored_windows: part.windows,
+            force_rmse_n: force.filter(|_| !part.turns),
+            torque_rmse_nm: force.filter(|_| part.turns),
+            position_rmse_m: rms(sum.position.0, sum.position.1).unwrap_or_default(),
+            rotation_rmse_rad: rms(sum.rotation, sum.position.1).unwrap_or_default(),
+        }
+    }
+}
+
+impl Evaluation {
+    /// From the scores of a bag.
+    pub fn new(
+        model: &str,
+        bag: &str,
+        was_learned: bool,
+        horizon_s: f64,
+        scores: &Scores,
+        counters: Counters,
+    ) -> Self {
+        let residuals =
+            |of: usize| scores.parts.iter().map(|(label, part)| Residuals::of(*label, part, of)).collect::<Vec<_>>();
+        Self {
+            schema: SCHEMA,
+            model: model.to_owned(),
+            bag: bag.to_owned(),
+            was_learned,
+            horizon_s,
+            windows: scores.windows,
+            before: residuals(0),
+            after: residuals(1),
+            counters,
+        }
+    }
+
+    /// Writes it as JSON, with a line's end.
+    ///
+    /// # Errors
+    /// A number that is not finite, by name, before anything is written; or what the system said.
+    pub fn write(&self, mut to: impl Write) -> Result<(), DocumentError> {
+        check_finite(self)?;
+        serde_json::to_writer_pretty(&mut to, self)?;
+        writeln!(to).map_err(serde_json::Error::io)?;
+        Ok(())
+    }
+}
+
+/// The table, as lines.
+pub fn table(evaluation: &Evaluation) -> String {
+    let Evaluation { bag, model, horizon_s, windows, .. } = evaluation;
+    let plural = if *windows == 1 { "" } else { "s" };
+    let mut text = format!("{bag}: {windows} window{plural}, scored by {model} over {horizon_s} s, nothing learned\n\n");
+    let _ = writeln!(text, "part  windows   position   rotation        force");
+    for (before, after) in evaluation.before.iter().zip(&evaluation.after) {
+        let _ = writeln!(text, "{:>4}  {:>7}  {}", before.label.0, before.scored_windows, columns(before));
+        if after != before {
+            let _ = writeln!(text, "{:>13}  {}  with effects", "", columns(after));
+        }
+    }
+    if evaluation.before.is_empty() {
+        let _ = writeln!(text, "No part that the model has a joint for moved.");
+    }
+    if evaluation.was_learned {
+        let _ = writeln!(text, "! the model has learned this bag: these are residuals, not predictions");
+    }
+    text
+}
+
+fn columns(residuals: &Residuals) -> String {
+    let force = match (residuals.force_rmse_n, residuals.torque_rmse_nm) {
+        (Some(force), _) => format!("{force:.3} N"),
+        (_, Some(torque)) => format!("{torque:.3} N·m"),
+        _ => "-".to_owned(),
+    };
+    let (millimetres, degrees) = (1e3 * residuals.position_rmse_m, residuals.rotation_rmse_rad.to_degrees());
+    format!("{millimetres:>6.2} mm  {degrees:>8.3}°  {force:>11}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tracking::ResidualSum;
+
+    #[test]
+    fn a_part_is_a_line_and_effects_are_another() {
+        let sum = ResidualSum { force: (0.5, 2), position: (4e-6, 4), rotation: 0.0 };
+        let less = ResidualSum { force: (0.02, 2), ..sum };
+        let part = |residuals, turns| PartScore { windows: 2, turns, residuals };
+        let parts = [(Label(1), part([sum, less], false)), (Label(5), part([sum, sum], true))].into_iter().collect();
+        let scores = Scores { windows: 3, parts };
+        let evaluation = Evaluation::new("m.json", "a.mcap", true, 1.0, &scores, Counters::default());
+        let expected = "a.mcap: 3 windows, scored by m.json over 1 s, nothing learned
+
+part  windows   position   rotation        force
+   1        2    1.00 mm     0.000°      0.500 N
+                 1.00 mm     0.000°      0.100 N  with effects
+   5        2    1.00 mm     0.000°    0.500 N·m
+! the model has learned this bag: these are residuals, not predictions
+";
+        assert_eq!(table(&evaluation), expected);
+        let value = serde_json::to_value(&evaluation).unwrap();
+        assert_eq!(value["before"][1]["torque_rmse_Nm"], 0.5);
+        assert!(value["before"][1].get("force_rmse_N").is_none());
+    }
+}

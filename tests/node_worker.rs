@@ -1,0 +1,89 @@
+//! Learning beside the stream: a worker that keeps up gives what a replay gives, one that lags behind
+//! gives the same posterior later.
+#![allow(clippy::unwrap_used)]
+
+use std::collections::VecDeque;
+use std::path::Path;
+
+use bayesian_object_models::{
+    io::{bag::Bag, config::Config, ingest::Ingest},
+    pipeline::{ClosedWindow, Output, Pipeline, Worker},
+    types::{Input, Label, posterior::ObjectPosterior},
+};
+
+/// The chain's first inputs, with a few windows in them.
+fn inputs() -> Vec<Input> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("bags/chain/chain.mcap");
+    let mut bag = Bag::open(&path).unwrap();
+    let mut ingest = Ingest::new(&Config::default().input);
+    let mut inputs = Vec::new();
+    while let Some(message) = bag.next() {
+        inputs.extend(ingest.push(&message.topic.name, &message.topic.type_name, message.bytes()));
+    }
+    let first = inputs.iter().map(Input::stamp).min().unwrap();
+    inputs.retain(|input| input.stamp().seconds_since(first) < 12.0);
+    inputs
+}
+
+fn pipeline(live: bool) -> Pipeline {
+    let mut settings = Config::default().pipeline_settings(None);
+    settings.live = live;
+    settings.predict = live;
+    Pipeline::new(settings)
+}
+
+/// A live run whose worker returns every window `lag` inputs after it closed.
+fn live(lag: usize) -> (ObjectPosterior, Vec<f64>) {
+    let (mut pipeline, mut worker) = (pipeline(true), Worker::default());
+    let mut waiting: VecDeque<(usize, Box<ClosedWindow>)> = VecDeque::new();
+    let (mut predicted, mut learned) = (Vec::new(), None);
+    let mut take = |outputs: Vec<Output>, waiting: &mut VecDeque<_>, at: usize| {
+        for output in outputs {
+            match output {
+                Output::WindowClosed(window) => waiting.push_back((at + lag, window)),
+                Output::Prediction { time_s, .. } => predicted.push(time_s),
+                _ => {}
+            }
+        }
+    };
+    for (at, input) in inputs().into_iter().enumerate() {
+        take(pipeline.push(input), &mut waiting, at);
+        while let Some((_, window)) = waiting.pop_front_if(|(due, _)| *due <= at) {
+            let result = worker.learn(&window);
+            pipeline.adopt(&result);
+            learned = Some(result.posterior);
+        }
+    }
+    take(pipeline.finish(), &mut waiting, 0);
+    for (_, window) in waiting {
+        let result = worker.learn(&window);
+        pipeline.adopt(&result);
+        learned = Some(result.posterior);
+    }
+    let posterior = pipeline.posterior().unwrap();
+    assert_eq!(learned.unwrap(), posterior, "what the worker says is what the pipeline adopted");
+    (posterior, predicted)
+}
+
+#[test]
+fn a_worker_learns_what_a_replay_learns() {
+    let mut replay = pipeline(false);
+    for input in inputs() {
+        replay.push(input);
+    }
+    replay.finish();
+    let replayed = replay.posterior().unwrap();
+    assert!(replayed.windows.len() >= 2, "{}", replayed.windows.len());
+    let (prompt, predicted) = live(0);
+    assert_eq!(prompt, replayed);
+    let mut stamps = predicted.clone();
+    stamps.sort_by(f64::total_cmp);
+    assert_eq!(stamps, predicted, "predictions come with their cloud, in order");
+    let (late, _) = live(400);
+    let joints = |posterior: &ObjectPosterior| -> Vec<(Label, Label, &'static str)> {
+        let likely = posterior.edges.iter().filter(|edge| edge.probability > 0.5);
+        likely.map(|edge| (edge.child, edge.parent, edge.joint_type.likeliest().0)).collect()
+    };
+    assert_eq!(late.windows.len(), replayed.windows.len());
+    assert_eq!(joints(&late), joints(&replayed));
+}
