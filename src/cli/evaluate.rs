@@ -4,13 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::{Context, bail};
 use bayesian_object_models::{
-    io::{
-        bag::Bag,
-        config::Config,
-        ingest::Ingest,
-        model_file::SavedModel,
-        output_file::OutputFile,
-    },
+    io::{bag::Bag, config::Config, ingest::Ingest, model_file::SavedModel, output_file::OutputFile},
     pipeline::{Output, Pipeline},
     report::evaluation::{Evaluation, table},
     types::Input,

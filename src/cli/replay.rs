@@ -263,11 +263,7 @@ impl Replay {
     }
 
     /// A step of the pipeline; where it learned windows, what it took is theirs.
-    fn timed(
-        &mut self,
-        step: impl FnOnce(&mut Pipeline) -> Vec<Output>,
-        files: &mut Outputs,
-    ) -> anyhow::Result<()> {
+    fn timed(&mut self, step: impl FnOnce(&mut Pipeline) -> Vec<Output>, files: &mut Outputs) -> anyhow::Result<()> {
         let begin = now();
         let outputs = step(&mut self.pipeline);
         let took = begin.elapsed();

@@ -86,8 +86,12 @@ impl Critic {
             let selected = selector.select(base.clone())?;
             // A window that no hypothesis comes near, while the others are explained, is none of the physics'.
             let outlying = outlying(&selected);
-            let rest_of_batch: Vec<BatchWindow> =
-                batch.iter().enumerate().filter(|(w, _)| !outlying.contains(w)).map(|(_, window)| window.clone()).collect();
+            let rest_of_batch: Vec<BatchWindow> = batch
+                .iter()
+                .enumerate()
+                .filter(|(w, _)| !outlying.contains(w))
+                .map(|(_, window)| window.clone())
+                .collect();
             let batch = &rest_of_batch[..];
             let selector = Selector { batch, ..selector };
             let (base, before, selected) = if outlying.is_empty() {

@@ -92,8 +92,9 @@ impl Workshop<'_> {
                     let declared = mechanism.joints[joint].effects.len();
                     let adopted = &self.learner.mechanism().joints[joint].effects;
                     let adopted = adopted.iter().skip(declared).find(|effect| effect.kind == kind).copied();
-                    let mut effect =
-                        adopted.or_else(|| self.learner.effect_on(joint, kind, self.fit)).ok_or(Failure::NoInformation)?;
+                    let mut effect = adopted
+                        .or_else(|| self.learner.effect_on(joint, kind, self.fit))
+                        .ok_or(Failure::NoInformation)?;
                     if adopted.is_none() {
                         effect.scales.duration_s = self.duration_s();
                     }

@@ -532,7 +532,10 @@ impl Selector<'_> {
             let Some(joint) = addition.joint() else { continue };
             // Where κ is large nothing gains much at first order.
             let count = tried.entry(joint).or_default();
-            if current.steps > BUDGET || *count >= TABLES_TRIED || (gain < LEAST_TABLE_GAIN && !misfits(&current, joint)) {
+            if current.steps > BUDGET
+                || *count >= TABLES_TRIED
+                || (gain < LEAST_TABLE_GAIN && !misfits(&current, joint))
+            {
                 continue;
             }
             *count += 1;

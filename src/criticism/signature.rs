@@ -57,13 +57,7 @@ pub fn probes(
     let force = scales.force;
     let plans = plans(workshop, &scales, joint, windows);
     for (kind, nodes, scale) in plans {
-        let table = AddedTable {
-            kind,
-            nodes,
-            scale: scale * force,
-            correlation: 1.0,
-            reversed: scales.travel < 0.0,
-        };
+        let table = AddedTable { kind, nodes, scale: scale * force, correlation: 1.0, reversed: scales.travel < 0.0 };
         probed.mechanism.joints[joint].tables.push(table);
     }
     let mechanism = &probed.mechanism;

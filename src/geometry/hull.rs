@@ -4,9 +4,9 @@
 //! width, not a measurement.
 
 use nalgebra::{Matrix3, Vector3};
-use serde::{Deserialize, Serialize};
 use parry3d_f64::mass_properties::MassProperties;
 use parry3d_f64::transformation::try_convex_hull;
+use serde::{Deserialize, Serialize};
 
 /// Thinnest plate that a flat cloud is taken for \[m\]: panels and doors of furniture are 15 mm to
 /// 25 mm, and a camera that sees one face cannot tell.

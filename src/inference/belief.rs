@@ -24,10 +24,7 @@ pub struct Factor<N> {
 
 /// Prior factors and sites.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(bound(
-    serialize = "N: Serialize, S: Serialize",
-    deserialize = "N: Deserialize<'de>, S: Deserialize<'de>"
-))]
+#[serde(bound(serialize = "N: Serialize, S: Serialize", deserialize = "N: Deserialize<'de>, S: Deserialize<'de>"))]
 pub struct Belief<N: Ord + Clone, S: Ord> {
     #[serde(with = "pairs")]
     priors: BTreeMap<N, Factor<N>>,

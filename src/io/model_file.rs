@@ -120,8 +120,7 @@ pub fn write_model(mut to: impl Write, bags: &[String], object: &SavedObjectRef<
     let content = serde_json::value::to_raw_value(&Content { bags, object }).map_err(failed)?;
     // A NaN would be written as null, and read as nothing: what cannot be read back is not written.
     serde_json::from_str::<SavedModel>(content.get()).map_err(failed)?;
-    let envelope =
-        Envelope { schema: SCHEMA.to_owned(), sha256: sha256(content.get().as_bytes()), content: &content };
+    let envelope = Envelope { schema: SCHEMA.to_owned(), sha256: sha256(content.get().as_bytes()), content: &content };
     serde_json::to_writer(&mut to, &envelope).map_err(failed)?;
     writeln!(to).map_err(|error| ModelError::Write(error.to_string()))
 }
@@ -169,7 +168,9 @@ mod tests {
     fn what_is_no_model_is_named() {
         assert!(error("").starts_with("m.json: no saved model: EOF"), "{}", error(""));
         assert!(error("[1, 2]").starts_with("m.json: no saved model: "));
-        assert!(error("{\"schema\": \"bom.posterior/1\", \"edges\": []}").contains("schema `bom.posterior/1`, expected"));
+        assert!(
+            error("{\"schema\": \"bom.posterior/1\", \"edges\": []}").contains("schema `bom.posterior/1`, expected")
+        );
         let other = "{\"schema\": \"bom.model/1\", \"sha256\": \"00\", \"content\": {\"bags\": []}}";
         assert!(error(other).starts_with("m.json: damaged: the content's SHA-256 is "), "{}", error(other));
         let sum = sha256(b"{\"bags\": []}");

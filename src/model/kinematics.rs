@@ -835,7 +835,8 @@ fn window_information(matrix: &DMatrix<f64>, systems: &[WindowSystem]) -> Vec<f6
     systems
         .iter()
         .map(|system| {
-            let coupled = system.local.clone().cholesky().map(|c| system.coupling.transpose() * c.solve(&system.coupling));
+            let coupled =
+                system.local.clone().cholesky().map(|c| system.coupling.transpose() * c.solve(&system.coupling));
             let own = coupled.map_or_else(|| system.global.clone(), |coupled| &system.global - coupled);
             (whole - log_determinant(matrix - own)).clamp(0.0, f64::MAX)
         })

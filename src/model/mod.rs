@@ -11,6 +11,8 @@ pub use dynamics::{
     LIMIT_DEVIATION, LOWER, Mechanism, PartDynamics, SENSOR_SIZE, SIZE, SensorModel, UPPER, WindowInference,
     WindowModel, WindowResidual,
 };
-pub use edges::{EdgeFit, EdgePart, axes_from_motion, moving_evidence, nearest_position, relative_windows, rigid_evidence};
+pub use edges::{
+    EdgeFit, EdgePart, axes_from_motion, moving_evidence, nearest_position, relative_windows, rigid_evidence,
+};
 pub use kinematics::{Axis, KinematicFit, KinematicJoint, KinematicSettings, fit_kinematics};
 pub use window::{Contact, PoseMeasurement, WindowObservations};

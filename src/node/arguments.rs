@@ -175,7 +175,8 @@ fn nodes_of(yaml: &Yaml, node: &str, source: &str, found: &mut Vec<Override>) ->
         let Some(key) = key.as_str() else { return Err(format!("`{node}`: a key is no text")) };
         if key == "ros__parameters" {
             flatten(content, "", &mut |name, value| {
-                let value = Value::from_yaml(value).ok_or_else(|| format!("`{name}`: not a value or a list of one type"))?;
+                let value =
+                    Value::from_yaml(value).ok_or_else(|| format!("`{name}`: not a value or a list of one type"))?;
                 let node = if node.is_empty() { "/**" } else { node };
                 let (node, name) = (node.to_owned(), name.to_owned());
                 found.push(Override { node, name, value, source: source.to_owned() });

@@ -33,7 +33,8 @@ pub async fn watch(managed: Managed) {
             }
         };
         let found = managed.health.lock().complaints(limits);
-        let new: Vec<&String> = found.iter().filter(|(key, _)| !known.contains_key(*key)).map(|(_, line)| line).collect();
+        let new: Vec<&String> =
+            found.iter().filter(|(key, _)| !known.contains_key(*key)).map(|(_, line)| line).collect();
         new.iter().for_each(|line| warn!("{line}"));
         for (_, line) in known.iter().filter(|(key, _)| !found.contains_key(*key)) {
             info!("over: {line}");
@@ -61,7 +62,11 @@ fn report(node: &str, health: &Health, complaints: &BTreeMap<String, String>) ->
         values,
     };
     let about = |keys: &[&str]| -> Vec<&String> {
-        complaints.iter().filter(|(key, _)| keys.iter().any(|start| key.starts_with(start))).map(|(_, line)| line).collect()
+        complaints
+            .iter()
+            .filter(|(key, _)| keys.iter().any(|start| key.starts_with(start)))
+            .map(|(_, line)| line)
+            .collect()
     };
     let parameters = about(&["parameter "]);
     let inference = about(&["windows dropped"]);

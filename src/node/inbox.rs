@@ -99,10 +99,8 @@ impl<C> Inbox<C> {
         let empty = |waiting: &mut Waiting<C>| {
             waiting.commands.is_empty() && waiting.readings.is_empty() && waiting.clouds.is_empty()
         };
-        let (mut waiting, _) = self
-            .arrived
-            .wait_timeout_while(self.lock(), patience, empty)
-            .unwrap_or_else(PoisonError::into_inner);
+        let (mut waiting, _) =
+            self.arrived.wait_timeout_while(self.lock(), patience, empty).unwrap_or_else(PoisonError::into_inner);
         Batch {
             commands: waiting.commands.drain(..).collect(),
             readings: waiting.readings.drain(..).collect(),

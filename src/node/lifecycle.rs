@@ -2,8 +2,8 @@
 //!
 //! <https://design.ros2.org/articles/node_lifecycle.html>. Numbers as in lifecycle_msgs.
 
-use ros2_interfaces_jazzy_serde::lifecycle_msgs::msg::{State as StateMessage, Transition as TransitionMessage};
 use ros2_interfaces_jazzy_serde::lifecycle_msgs::msg::TransitionDescription;
+use ros2_interfaces_jazzy_serde::lifecycle_msgs::msg::{State as StateMessage, Transition as TransitionMessage};
 
 /// A primary state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -128,7 +128,8 @@ mod tests {
     #[test]
     fn a_manager_brings_it_up_and_down() {
         let mut state = State::Unconfigured;
-        for (id, expected) in [(1, State::Inactive), (3, State::Active), (4, State::Inactive), (2, State::Unconfigured)] {
+        for (id, expected) in [(1, State::Inactive), (3, State::Active), (4, State::Inactive), (2, State::Unconfigured)]
+        {
             state = ask(state, id, "").unwrap();
             assert_eq!(state, expected);
         }

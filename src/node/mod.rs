@@ -59,7 +59,8 @@ pub fn run(arguments: &RosArguments) -> anyhow::Result<()> {
     let names = Names::new(NAME, arguments)?;
     let mut parameters = Parameters::declared();
     let unusable = parameters.start_with(&arguments.overrides, &names);
-    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().context("tokio")?;
+    let runtime =
+        tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().context("tokio")?;
     runtime.block_on(live(&names, parameters, unusable, !arguments.rosout_disabled))
 }
 
@@ -91,7 +92,8 @@ async fn live(names: &Names, parameters: Parameters, unusable: Vec<String>, roso
     let learning =
         Learning::start(threads, health.clone(), move |life, learned| adopt.tell(Command::Adopt(life, learned)))?;
     let stream = Stream::new(Arc::clone(&inbox), learning, outputs.clone(), health.clone(), input.clone());
-    let thread = std::thread::Builder::new().name("stream".into()).spawn(|| stream.run()).context("the stream's thread")?;
+    let thread =
+        std::thread::Builder::new().name("stream".into()).spawn(|| stream.run()).context("the stream's thread")?;
     let mut subscriptions =
         Subscriptions::new(&mut participant, &parameters, &input, Arc::clone(&inbox), health.clone())?;
     endpoints.extend(subscriptions.names.clone());
@@ -151,7 +153,10 @@ async fn watch_network(
                 endpoints.extend(subscriptions.names.clone());
             }
             DomainParticipantStatusEvent::RemoteWriterQosIncompatible {
-                local_reader, requested_qos, offered_qos, ..
+                local_reader,
+                requested_qos,
+                offered_qos,
+                ..
             } => {
                 if let Some(topic) = endpoints.get(&local_reader) {
                     let line = mismatch("a publisher's QoS does not fit", &requested_qos, &offered_qos);
@@ -159,7 +164,10 @@ async fn watch_network(
                 }
             }
             DomainParticipantStatusEvent::RemoteReaderQosIncompatible {
-                local_writer, requested_qos, offered_qos, ..
+                local_writer,
+                requested_qos,
+                offered_qos,
+                ..
             } => {
                 if let Some(topic) = endpoints.get(&local_writer) {
                     let line = mismatch("a subscriber's QoS does not fit", &requested_qos, &offered_qos);

@@ -91,26 +91,70 @@ impl Parameters {
         });
         let texts = |items: &[&str]| Value::StringArray(items.iter().map(|item| (*item).to_owned()).collect());
         let own = [
-            ("input.wrenches.topics", texts(&["wrench"]), None, Change::AtStart,
-             "Topics of wrenches (geometry_msgs/WrenchStamped)."),
-            ("input.wrenches.parts", texts(&["auto"]), None, Change::Unconfigured,
-             "For each of these topics the part that its tool acts on: a label, or auto to find the one in contact."),
-            ("input.wrenches.reactions", Value::BoolArray(vec![false]), None, Change::Unconfigured,
-             "For each of these topics whether the sensor reports what the object does to the tool."),
-            ("root_label", Value::Integer(-1), Some((-1.0, f64::from(u32::MAX))), Change::Unconfigured,
-             "The part that is fixed to the world; -1: found out."),
-            ("use_sim_time", Value::Bool(false), None, Change::AtStart,
-             "Whether /clock is the time."),
-            ("autostart", Value::Bool(true), None, Change::AtStart,
-             "Whether the node configures and activates itself; false: a lifecycle manager does."),
-            ("publish_tf", Value::Bool(false), None, Change::Always,
-             "Whether the parts' frames are sent on /tf, where they are and not only on ~/joint_states."),
-            ("slowest_clouds_hz", Value::Double(5.0), Some((0.1, 100.0)), Change::Always,
-             "A warning says when clouds come more slowly than this [Hz]."),
-            ("wrench_timeout_s", Value::Double(0.3), Some((0.01, 60.0)), Change::Always,
-             "A warning says when a wrench topic has been silent for this long [s]."),
-            ("worker_threads", Value::Integer(0), Some((0.0, 1024.0)), Change::AtStart,
-             "Threads that inference may use; 0: all cores but one."),
+            (
+                "input.wrenches.topics",
+                texts(&["wrench"]),
+                None,
+                Change::AtStart,
+                "Topics of wrenches (geometry_msgs/WrenchStamped).",
+            ),
+            (
+                "input.wrenches.parts",
+                texts(&["auto"]),
+                None,
+                Change::Unconfigured,
+                "For each of these topics the part that its tool acts on: a label, or auto to find the one in contact.",
+            ),
+            (
+                "input.wrenches.reactions",
+                Value::BoolArray(vec![false]),
+                None,
+                Change::Unconfigured,
+                "For each of these topics whether the sensor reports what the object does to the tool.",
+            ),
+            (
+                "root_label",
+                Value::Integer(-1),
+                Some((-1.0, f64::from(u32::MAX))),
+                Change::Unconfigured,
+                "The part that is fixed to the world; -1: found out.",
+            ),
+            ("use_sim_time", Value::Bool(false), None, Change::AtStart, "Whether /clock is the time."),
+            (
+                "autostart",
+                Value::Bool(true),
+                None,
+                Change::AtStart,
+                "Whether the node configures and activates itself; false: a lifecycle manager does.",
+            ),
+            (
+                "publish_tf",
+                Value::Bool(false),
+                None,
+                Change::Always,
+                "Whether the parts' frames are sent on /tf, where they are and not only on ~/joint_states.",
+            ),
+            (
+                "slowest_clouds_hz",
+                Value::Double(5.0),
+                Some((0.1, 100.0)),
+                Change::Always,
+                "A warning says when clouds come more slowly than this [Hz].",
+            ),
+            (
+                "wrench_timeout_s",
+                Value::Double(0.3),
+                Some((0.01, 60.0)),
+                Change::Always,
+                "A warning says when a wrench topic has been silent for this long [s].",
+            ),
+            (
+                "worker_threads",
+                Value::Integer(0),
+                Some((0.0, 1024.0)),
+                Change::AtStart,
+                "Threads that inference may use; 0: all cores but one.",
+            ),
         ];
         for (name, value, range, change, text) in own {
             declared.insert(name.to_owned(), Declaration::new(text, value, range, change));
@@ -256,7 +300,8 @@ impl Parameters {
             let part = parts.get(of(index, parts.len())).map_or("auto", String::as_str);
             let part = part.parse::<u32>().map_or_else(|_| Yaml::from(part), Yaml::from);
             wrench.insert("part".into(), part);
-            wrench.insert("reaction".into(), reactions.get(of(index, reactions.len())).copied().unwrap_or(false).into());
+            wrench
+                .insert("reaction".into(), reactions.get(of(index, reactions.len())).copied().unwrap_or(false).into());
             Yaml::Mapping(wrench)
         };
         Ok(Yaml::Sequence(topics.iter().enumerate().map(|(index, topic)| entry(index, topic)).collect()))
@@ -280,8 +325,7 @@ impl Parameters {
         };
         match (&declaration.value, declaration.range) {
             (Value::Integer(_), Some((from, to))) => {
-                descriptor.integer_range =
-                    vec![IntegerRange { from_value: from as i64, to_value: to as i64, step: 1 }];
+                descriptor.integer_range = vec![IntegerRange { from_value: from as i64, to_value: to as i64, step: 1 }];
             }
             (Value::Double(_), Some((from, to))) => {
                 descriptor.floating_point_range =
@@ -301,9 +345,9 @@ fn qos_prefix(topic: &str, reads: bool) -> String {
 
 /// The value that a parameter takes, in its own type.
 fn checked(name: &str, declaration: &Declaration, value: &Value) -> Result<Value, String> {
-    let value = value.in_type_of(&declaration.value).ok_or_else(|| {
-        format!("`{name}`: {}, expected {}", value.type_name(), declaration.value.type_name())
-    })?;
+    let value = value
+        .in_type_of(&declaration.value)
+        .ok_or_else(|| format!("`{name}`: {}, expected {}", value.type_name(), declaration.value.type_name()))?;
     if let (Some(number), Some((from, to))) = (value.as_double(), declaration.range)
         && !(from..=to).contains(&number)
     {

@@ -7,12 +7,12 @@ use std::net::{IpAddr, Ipv4Addr};
 
 use anyhow::{Context as _, bail};
 use ros2_client::{
-    Context, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher, Server, ServiceMapping,
-    ServiceTypeName, Subscription,
+    Context, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher, Server, ServiceMapping, ServiceTypeName,
+    Subscription,
     ros2::{Duration, QosPolicies, QosPolicyBuilder, QosProfile, policy},
 };
-use rustdds::{DomainParticipant, DomainParticipantBuilder, Topic, TopicKind};
 use ros2_interfaces_jazzy_serde::rcl_interfaces::msg::Log;
+use rustdds::{DomainParticipant, DomainParticipantBuilder, Topic, TopicKind};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use super::names::Names;

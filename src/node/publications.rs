@@ -5,12 +5,8 @@ use std::time::Instant;
 
 use ros2_client::Publisher;
 use ros2_interfaces_jazzy_serde::{
-    diagnostic_msgs::msg::DiagnosticArray,
-    lifecycle_msgs::msg::TransitionEvent,
-    rcl_interfaces::msg::ParameterEvent,
-    sensor_msgs::msg::JointState,
-    std_msgs::msg::String as Text,
-    tf2_msgs::msg::TFMessage,
+    diagnostic_msgs::msg::DiagnosticArray, lifecycle_msgs::msg::TransitionEvent, rcl_interfaces::msg::ParameterEvent,
+    sensor_msgs::msg::JointState, std_msgs::msg::String as Text, tf2_msgs::msg::TFMessage,
     visualization_msgs::msg::MarkerArray,
 };
 use serde::Serialize;
@@ -80,11 +76,7 @@ impl Publishers {
     ///
     /// # Errors
     /// A name that is none, or DDS.
-    pub fn new(
-        participant: &mut Participant,
-        parameters: &Parameters,
-        health: SharedHealth,
-    ) -> anyhow::Result<Self> {
+    pub fn new(participant: &mut Participant, parameters: &Parameters, health: SharedHealth) -> anyhow::Result<Self> {
         let mut names = BTreeMap::new();
         let own = |message: &str| format!("{}/msg/{message}", messages::PACKAGE);
         let quality = |topic: &str, latched| {

@@ -244,7 +244,9 @@ fn serve_parameters(participant: &mut Participant, managed: &Managed) -> anyhow:
     let service = ("~/describe_parameters", "rcl_interfaces/srv/DescribeParameters");
     at_once(participant, managed, service, |managed, request: DescribeParametersRequest| {
         let parameters = managed.parameters();
-        DescribeParametersResponse { descriptors: request.names.iter().map(|name| parameters.descriptor(name)).collect() }
+        DescribeParametersResponse {
+            descriptors: request.names.iter().map(|name| parameters.descriptor(name)).collect(),
+        }
     })
 }
 

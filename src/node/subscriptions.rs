@@ -18,8 +18,7 @@ use super::participant::{Participant, Quality};
 use crate::io::config::InputConfig;
 use crate::io::ingest::Message;
 use crate::io::messages::{
-    POINT_CLOUD_TYPE, POSE_TYPE, PointCloud2, PoseWithCovarianceStamped, TF_TYPE, TfMessage, WRENCH_TYPE,
-    WrenchStamped,
+    POINT_CLOUD_TYPE, POSE_TYPE, PointCloud2, PoseWithCovarianceStamped, TF_TYPE, TfMessage, WRENCH_TYPE, WrenchStamped,
 };
 
 /// A message as the inbox takes it.
@@ -114,9 +113,16 @@ impl<C: fmt::Debug + Send + 'static> Subscriptions<C> {
             Quality { reliable, latched: false, depth }
         };
         let poses = quality("parts/poses");
-        let mut all = Self { inbox, health, input: input.clone(), poses, known: BTreeSet::new(), names: BTreeMap::new() };
+        let mut all =
+            Self { inbox, health, input: input.clone(), poses, known: BTreeSet::new(), names: BTreeMap::new() };
         for topic in &input.clouds {
-            all.listen::<PointCloud2<'static>>(participant, topic, POINT_CLOUD_TYPE, Kind::Cloud, quality("parts/points"))?;
+            all.listen::<PointCloud2<'static>>(
+                participant,
+                topic,
+                POINT_CLOUD_TYPE,
+                Kind::Cloud,
+                quality("parts/points"),
+            )?;
         }
         for wrench in &input.wrenches {
             all.listen::<WrenchStamped>(participant, &wrench.topic, WRENCH_TYPE, Kind::Wrench, quality("wrench"))?;
@@ -215,7 +221,10 @@ pub fn watch_clock(
             }
             last_s = Some(time_s);
             if step_s < 0.0 {
-                health.jumped(format!("/clock went back by {:.3} s: the stream begins again, what was learned is kept", -step_s));
+                health.jumped(format!(
+                    "/clock went back by {:.3} s: the stream begins again, what was learned is kept",
+                    -step_s
+                ));
                 drop(health);
                 jumped();
             } else if step_s > 1.0 {

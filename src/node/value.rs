@@ -49,8 +49,16 @@ impl Value {
     /// The name of its type.
     pub fn type_name(&self) -> &'static str {
         const NAMES: [&str; 10] = [
-            "not set", "bool", "integer", "double", "string", "byte array", "bool array", "integer array",
-            "double array", "string array",
+            "not set",
+            "bool",
+            "integer",
+            "double",
+            "string",
+            "byte array",
+            "bool array",
+            "integer array",
+            "double array",
+            "string array",
         ];
         NAMES[usize::from(self.type_number())]
     }
@@ -60,7 +68,9 @@ impl Value {
         Some(match yaml {
             Yaml::Null => Self::NotSet,
             Yaml::Bool(value) => Self::Bool(*value),
-            Yaml::Number(number) => number.as_i64().map_or_else(|| number.as_f64().map(Self::Double), |i| Some(Self::Integer(i)))?,
+            Yaml::Number(number) => {
+                number.as_i64().map_or_else(|| number.as_f64().map(Self::Double), |i| Some(Self::Integer(i)))?
+            }
             Yaml::String(text) => Self::String(text.clone()),
             Yaml::Sequence(items) => {
                 let items: Vec<Self> = items.iter().map(Self::from_yaml).collect::<Option<_>>()?;

@@ -8,8 +8,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{Matrix6, Vector3, Vector6};
-use serde::{Deserialize, Serialize};
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 use crate::math::{Pose, Screw};
 use crate::mechanism::JointType;

@@ -3,11 +3,11 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{DMatrix, Vector3};
-use serde::{Deserialize, Serialize};
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
-use super::keyframes::Keyframes;
 use super::explain::{Baseline, Frame, Motion, Scene, explain_window, measure_faces, travel};
+use super::keyframes::Keyframes;
 use crate::criticism::Critic;
 use crate::geometry::{HullProperties, hull_properties};
 use crate::math::Pose;
@@ -313,9 +313,9 @@ impl Learner {
         let model = &self.models[&label];
         self.moved_before.contains(&label)
             || self
-            .tracks
-            .get(&label)
-            .is_some_and(|windows| windows.iter().flatten().any(|d| travel(model, &Pose::identity(), d) > MOVED))
+                .tracks
+                .get(&label)
+                .is_some_and(|windows| windows.iter().flatten().any(|d| travel(model, &Pose::identity(), d) > MOVED))
     }
 
     /// A part that is met later than the others, with its surfels at the reference configuration.

@@ -103,7 +103,8 @@ impl Learner {
     /// had not moved, and so was as good as the world.
     pub(super) fn past_evidence(&self, child: Label, parent: Option<Label>) -> [f64; 3] {
         let Some(options) = self.evidence.get(&child) else { return [0.0; 3] };
-        let of = |parent: Option<Label>| options.iter().find(|option| option.parent == parent).map(|option| option.past);
+        let of =
+            |parent: Option<Label>| options.iter().find(|option| option.parent == parent).map(|option| option.past);
         of(parent).or_else(|| of(None)).unwrap_or_default()
     }
 }

@@ -176,7 +176,9 @@ impl Learner {
     fn locate(&mut self, frame: &Frame) -> Vec<f64> {
         let joints: Vec<KinematicJoint> = self.joints().to_vec();
         let last: Vec<f64> = (0..joints.len())
-            .map(|joint| self.fit.as_ref().and_then(|fit| fit.positions.last()?.get(joint)?.last().copied()).unwrap_or(0.0))
+            .map(|joint| {
+                self.fit.as_ref().and_then(|fit| fit.positions.last()?.get(joint)?.last().copied()).unwrap_or(0.0)
+            })
             .collect();
         let mut positions = last;
         for (index, joint) in joints.iter().enumerate() {
@@ -223,19 +225,11 @@ impl Learner {
 }
 
 /// The joint's position at which a scan costs least, near or far from where it was.
-fn located(
-    model: &PartModel,
-    scan: &[ScanPoint],
-    joint: &KinematicJoint,
-    parent: &Pose,
-    last: f64,
-) -> f64 {
+fn located(model: &PartModel, scan: &[ScanPoint], joint: &KinematicJoint, parent: &Pose, last: f64) -> f64 {
     let screw = joint.screw();
     let grid = grid_of(model, &screw, joint.joint_type);
     let frame = JointFrame { scan, parent: *parent, tool: None };
-    let cost = |q: f64| {
-        truncated_cost(model, scan, scan.len() / REFINING_POINTS, &(*parent * screw.displacement(q)))
-    };
+    let cost = |q: f64| truncated_cost(model, scan, scan.len() / REFINING_POINTS, &(*parent * screw.displacement(q)));
     let refined = |start: f64| {
         let (mut best, mut step) = ((cost(start), start), 0.5 * grid.2);
         for _ in 0..5 {

@@ -133,7 +133,11 @@ fn carried_output(output: Output, world_from_work: &Pose, begin_s: f64) -> Outpu
         Output::Observation { time_s, label, measurement } => {
             let displacement = *world_from_work * measurement.displacement * world_from_work.inverse();
             let information = turned(&measurement.information, &world_from_work.rotation);
-            Output::Observation { time_s: time_s - begin_s, label, measurement: PoseMeasurement { displacement, information } }
+            Output::Observation {
+                time_s: time_s - begin_s,
+                label,
+                measurement: PoseMeasurement { displacement, information },
+            }
         }
         Output::Prediction { time_s, horizon_s, label, displacement, covariance_m2 } => {
             let displacement = *world_from_work * displacement * world_from_work.inverse();

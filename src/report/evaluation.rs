@@ -62,14 +62,7 @@ impl Residuals {
 
 impl Evaluation {
     /// From the scores of a bag.
-    pub fn new(
-        model: &str,
-        bag: &str,
-        was_learned: bool,
-        horizon_s: f64,
-        scores: &Scores,
-        counters: Counters,
-    ) -> Self {
+    pub fn new(model: &str, bag: &str, was_learned: bool, horizon_s: f64, scores: &Scores, counters: Counters) -> Self {
         let residuals =
             |of: usize| scores.parts.iter().map(|(label, part)| Residuals::of(*label, part, of)).collect::<Vec<_>>();
         Self {
@@ -101,7 +94,8 @@ impl Evaluation {
 pub fn table(evaluation: &Evaluation) -> String {
     let Evaluation { bag, model, horizon_s, windows, .. } = evaluation;
     let plural = if *windows == 1 { "" } else { "s" };
-    let mut text = format!("{bag}: {windows} window{plural}, scored by {model} over {horizon_s} s, nothing learned\n\n");
+    let mut text =
+        format!("{bag}: {windows} window{plural}, scored by {model} over {horizon_s} s, nothing learned\n\n");
     let _ = writeln!(text, "part  windows   position   rotation        force");
     for (before, after) in evaluation.before.iter().zip(&evaluation.after) {
         let _ = writeln!(text, "{:>4}  {:>7}  {}", before.label.0, before.scored_windows, columns(before));

@@ -29,8 +29,7 @@ pub struct Evidence<'a> {
 pub fn page(run: &Run<'_>, evidence: &Evidence<'_>) -> String {
     let posterior = &run.document.posterior;
     let found = Found::new(posterior);
-    let moved: Vec<Label> =
-        Gatherer::joints_of(posterior, &found).iter().map(|joint| joint.edge.child).collect();
+    let moved: Vec<Label> = Gatherer::joints_of(posterior, &found).iter().map(|joint| joint.edge.child).collect();
     html! {
         (DOCTYPE)
         html lang="en" {
@@ -194,7 +193,8 @@ fn error_charts(label: Label, errors: &[ErrorSeries], stream_s: f64) -> Markup {
     if let Some(near) = at(0.1) {
         lines.push(Line { pieces: vec![&near.errors], ink: Ink::Third, dots: false });
     }
-    let chart = Chart { value: "error [m]".into(), lines, spans: Vec::new(), times_s: (0.0, stream_s), from_zero: true };
+    let chart =
+        Chart { value: "error [m]".into(), lines, spans: Vec::new(), times_s: (0.0, stream_s), from_zero: true };
     let summary: Vec<String> = errors
         .iter()
         .filter(|series| !series.errors.is_empty())

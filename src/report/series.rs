@@ -95,10 +95,9 @@ impl Gatherer {
         let parents = self.observed.get(&joint.edge.parent).map_or(&[][..], Vec::as_slice);
         let mut last = 0.0;
         for (time_s, displacement) in self.observed.get(&child).into_iter().flatten() {
-            let parent = parents.binary_search_by(|(t, _)| t.total_cmp(time_s)).map_or_else(
-                |_| Pose::identity(),
-                |index| parents[index].1,
-            );
+            let parent = parents
+                .binary_search_by(|(t, _)| t.total_cmp(time_s))
+                .map_or_else(|_| Pose::identity(), |index| parents[index].1);
             last = axis.position(&(parent.inverse() * *displacement), &center, last);
             series.observed.push((*time_s, last));
         }

@@ -126,10 +126,8 @@ impl Filter {
             coordinates.extend(2 * n..2 * n + 3);
         }
         coordinates.retain(|&at| self.covariance[(at, at)] > 1e-16);
-        let deviations = DVector::from_iterator(
-            coordinates.len(),
-            coordinates.iter().map(|&at| self.covariance[(at, at)].sqrt()),
-        );
+        let deviations =
+            DVector::from_iterator(coordinates.len(), coordinates.iter().map(|&at| self.covariance[(at, at)].sqrt()));
         let correlation = DMatrix::from_fn(coordinates.len(), coordinates.len(), |i, j| {
             self.covariance[(coordinates[i], coordinates[j])] / (deviations[i] * deviations[j])
         });
@@ -190,9 +188,8 @@ impl Filter {
     /// Variance of a joint's position by the unmodelled force over a span: ∫∫ of white acceleration.
     fn unmodelled(&self, joint: usize, span_s: f64) -> f64 {
         let inertia = self.inertia(joint);
-        let density =
-            FORCE_DENSITY * self.mechanism.noise_scale * self.unease * self.mechanism.reach(joint).powi(2)
-                / inertia.powi(2);
+        let density = FORCE_DENSITY * self.mechanism.noise_scale * self.unease * self.mechanism.reach(joint).powi(2)
+            / inertia.powi(2);
         density * span_s.powi(3) / 3.0
     }
 }

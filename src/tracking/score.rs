@@ -140,12 +140,7 @@ impl MeasuredPath {
 
     /// The constant force on a joint that lets a span end where it was seen to; `None` where the joint
     /// rests and should, or no force is found.
-    fn missing_force(
-        &self,
-        joint: usize,
-        span: &std::ops::Range<usize>,
-        mechanism: &TrackedMechanism,
-    ) -> Option<f64> {
+    fn missing_force(&self, joint: usize, span: &std::ops::Range<usize>, mechanism: &TrackedMechanism) -> Option<f64> {
         let goal = self.positions[joint][span.end - 1];
         let reach = reach(mechanism, joint);
         let miss = |force: f64| {

@@ -5,7 +5,8 @@ use nalgebra::DMatrix;
 use super::batch::{BatchWindow, Hypothesis};
 use super::layout::{AddedEffect, JointModel, JointScales, LOWER, Mechanism, SENSOR_SIZE, SIZE, UPPER};
 use super::learner::{
-    Block, DynamicsInput, DynamicsLearner, Site, Warm, added_effect, extended, kinematics_of, standard_sensor, travel_of,
+    Block, DynamicsInput, DynamicsLearner, Site, Warm, added_effect, extended, kinematics_of, standard_sensor,
+    travel_of,
 };
 use super::track::{JointTrack, joint_track};
 use crate::inference::{Failure, Gaussian};
