@@ -49,7 +49,7 @@ fn registration(bencher: Bencher, points: usize) {
     for _ in 0..5 {
         accumulator.add(&drawer(10_000), &Pose::identity());
     }
-    let model = PartModel::new(&accumulator.surfels(), &[]).unwrap();
+    let model = PartModel::new(&accumulator.surfels()).unwrap();
     let start = Pose::exp(&nalgebra::Vector6::new(0.01, -0.005, 0.01, 0.006, 0.004, -0.004));
     let settings = AlignmentSettings::default();
     bencher.bench_local(|| align(&model, black_box(&scan), &start, &Matrix6::identity(), &settings, 6));

@@ -15,6 +15,7 @@
 //! the wall: `math`, `types`, `geometry`, `registration`, `mechanism`, `structure`, `inference`,
 //! `model`, `tracking`, `pipeline`, `io`, `report`, `ros`, `node`.
 
+pub mod criticism;
 pub mod geometry;
 pub mod inference;
 pub mod io;

@@ -13,7 +13,7 @@ use thiserror::Error;
 
 use crate::{
     inference::{Sampler, SamplingSettings},
-    model::KinematicSettings,
+    model::{DeclaredPhysics, KinematicSettings},
     pipeline::{PipelineSettings, PoseSettings, WindowSettings},
     types::Label,
 };
@@ -67,6 +67,8 @@ pub struct Config {
     pub observations: ObservationConfig,
     /// What is assumed of pose measurements.
     pub kinematics: KinematicSettings,
+    /// Which physics is in the model from the start.
+    pub model: DeclaredPhysics,
 }
 
 impl Default for Config {
@@ -83,6 +85,7 @@ impl Default for Config {
             poses: PoseSettings::default(),
             observations: ObservationConfig::default(),
             kinematics: KinematicSettings::default(),
+            model: DeclaredPhysics::default(),
         }
     }
 }
@@ -99,6 +102,7 @@ impl Config {
             kinematics: self.kinematics,
             gravity_in_world: self.gravity_m_s2.into(),
             sampling: self.sampling(),
+            declared: self.model.clone(),
             predict: false,
             posterior_latency_s: self.posterior_latency_s,
             live: false,

@@ -1,6 +1,6 @@
 //! What a joint does by itself: damping, Coulomb friction, extra inertia, limits, effects.
 
-use super::effects::{AttachedEffect, JointState};
+use super::effects::{AttachedEffect, AttachedTable, JointState};
 use super::friction::FrictionBounds;
 use super::limits::Limit;
 use crate::math::Real;
@@ -20,6 +20,8 @@ pub struct JointParameters<T: Real> {
     pub upper: Option<Limit<T>>,
     /// Undeclared effects that act here.
     pub effects: Vec<AttachedEffect<T>>,
+    /// What acts here and has no formula.
+    pub tables: Vec<AttachedTable<T>>,
 }
 
 impl<T: Real> Default for JointParameters<T> {
@@ -42,13 +44,22 @@ pub struct JointForces<T: Real> {
 impl<T: Real> JointParameters<T> {
     /// Damping \[N·s/m or N·m·s/rad\] and Coulomb friction \[N or N·m\], and nothing else.
     pub fn new(damping: T, friction: T) -> Self {
-        Self { damping, friction, armature: T::zero(), lower: None, upper: None, effects: Vec::new() }
+        Self {
+            damping,
+            friction,
+            armature: T::zero(),
+            lower: None,
+            upper: None,
+            effects: Vec::new(),
+            tables: Vec::new(),
+        }
     }
 
     /// All that the joint does at this state.
     pub fn forces(&self, joint: &JointState<T>) -> JointForces<T> {
         let declared =
             JointForces { force: T::zero(), damping: self.damping, friction: FrictionBounds::symmetric(self.friction) };
-        self.effects.iter().fold(declared, |forces, effect| effect.apply(joint, forces))
+        let named = self.effects.iter().fold(declared, |forces, effect| effect.apply(joint, forces));
+        self.tables.iter().fold(named, |forces, table| table.apply(joint, forces))
     }
 }

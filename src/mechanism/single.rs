@@ -101,8 +101,13 @@ impl<'a, T: Real> SingleJoint<'a, T> {
         let half = T::constant(0.5 * step_s);
         let rate = state.rate;
         let middle = state.position + rate * half;
-        let joint =
-            JointState { position: middle, rate: middle_rate(rate, state.rate_before), time_s: middle_s, step_s };
+        let joint = JointState {
+            position: middle,
+            rate: middle_rate(rate, state.rate_before),
+            acceleration: (rate - state.rate_before) * T::constant(1.0 / step_s),
+            time_s: middle_s,
+            step_s,
+        };
         let forces = self.parameters.forces(&joint);
         let damping = ImplicitDamping::new(forces.damping, self.inertia, step_s);
         let impulse =

@@ -109,6 +109,7 @@ pub fn step<T: Real>(
         let joint = JointState {
             position: workspace.middle[body],
             rate: workspace.middle_rates[k],
+            acceleration: (rate - state.rates_before[body]) * T::constant(1.0 / step.length_s),
             time_s: step.middle_s,
             step_s: step.length_s,
         };

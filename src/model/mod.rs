@@ -6,7 +6,10 @@ mod kinematics;
 mod window;
 
 pub use dynamics::{
-    DynamicsInput, DynamicsLearner, DynamicsPosterior, JointDynamics, PartDynamics, SamplingReport, WindowInference,
+    AddedEffect, AddedTable, BatchFit, BatchWindow, BatchedWindow, DAMPING, DeclaredPhysics, DynamicsInput,
+    DynamicsLearner, DynamicsPosterior, FRICTION, Hypothesis, INERTIA, JointDynamics, JointModel, JointScales,
+    LIMIT_DEVIATION, LOWER, Mechanism, PartDynamics, SENSOR_SIZE, SIZE, SamplingReport, SensorModel, UPPER,
+    WindowInference, WindowModel, WindowResidual,
 };
 pub use edges::{
     EdgeFit, EdgePart, axes_from_motion, moving_evidence, nearest_position, relative_windows, rigid_evidence,

@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::explain::{Baseline, Frame, Motion, Scene, explain_contacts, measure_faces, rays_past, travel};
 use super::keyframes::Keyframes;
 use super::poses::{POSED_RADIUS, PosedPart, measured_motion};
+use crate::criticism::Critic;
 use crate::geometry::{HullProperties, hull_properties};
 use crate::inference::SamplingSettings;
 use crate::math::Pose;
@@ -170,6 +171,8 @@ pub struct Learner {
     pub settings: KinematicSettings,
     /// Friction, damping, inertia and end stops.
     pub dynamics: DynamicsLearner,
+    /// What the dynamics lack.
+    pub critic: Critic,
     /// What learning each window's dynamics gave.
     pub inferences: Vec<WindowInference>,
     /// Every window that was learned, kept or not.
@@ -211,6 +214,7 @@ impl Learner {
             fit: None,
             settings: KinematicSettings::default(),
             dynamics: DynamicsLearner::new(Vector3::new(0.0, 0.0, -9.81)),
+            critic: Critic::default(),
             inferences: Vec::new(),
             records: Vec::new(),
             hulls: BTreeMap::new(),
@@ -410,7 +414,12 @@ impl Learner {
         let windows: Vec<&WindowObservations> = self.windows.iter().collect();
         let input =
             DynamicsInput { windows: &windows, contacts, zero: job.zero, parts: &self.hulls, use_tool: self.use_tool };
-        self.inferences.push(self.dynamics.learn_window(fit, &input));
+        let mut inference = self.dynamics.learn_window(fit, &input);
+        match self.critic.review(&mut self.dynamics, fit, &input) {
+            Ok(steps) => inference.steps += steps,
+            Err(failure) => tracing::debug!(%failure, "no review"),
+        }
+        self.inferences.push(inference);
     }
 
     /// The dynamics as they are published: by the engine that was asked for.

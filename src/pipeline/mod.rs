@@ -32,7 +32,7 @@ pub use worker::{ClosedWindow, Learned, Worker};
 
 use crate::inference::SamplingSettings;
 use crate::math::Pose;
-use crate::model::{DynamicsLearner, KinematicSettings, PoseMeasurement};
+use crate::model::{DeclaredPhysics, DynamicsLearner, KinematicSettings, PoseMeasurement};
 use crate::registration::{AlignmentSettings, Quadratic, SurfelAccumulator, align, truncated_cost};
 use crate::types::{Input, Label, Stamp};
 use evaluate::Scoring;
@@ -67,6 +67,8 @@ pub struct PipelineSettings {
     pub gravity_in_world: Vector3<f64>,
     /// How the published dynamics are sampled; `None`: they are SVI's own.
     pub sampling: Option<SamplingSettings>,
+    /// What is in the model of every joint from the start.
+    pub declared: DeclaredPhysics,
     /// Whether to predict.
     pub predict: bool,
     /// For prediction, a posterior counts from its window's close plus this \[s\].
@@ -335,7 +337,7 @@ impl Pipeline {
         learner.sampling = self.settings.sampling;
         learner.kept_windows = self.settings.windows.kept;
         learner.root_is_given = self.settings.root.is_some();
-        learner.dynamics = DynamicsLearner::new(self.gravity_in_work());
+        learner.dynamics = DynamicsLearner::new(self.gravity_in_work()).declaring(self.settings.declared.clone());
         learner.calibrate(&self.reference);
         learner.world = (self.settings.root.is_none() && largest.is_none()).then_some(root);
         for (label, part) in posed {

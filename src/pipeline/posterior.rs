@@ -91,7 +91,7 @@ fn posterior(root_label: Label, seen: &Parts, learner: Option<&Learner>) -> Obje
         parts,
         edges: edges(root_label, &labels, known),
         windows: learner.map(|learner| learner.records.clone()).unwrap_or_default(),
-        criticism: Criticism::insufficient(),
+        criticism: learner.map_or_else(Criticism::insufficient, |learner| learner.critic.findings()),
     }
 }
 

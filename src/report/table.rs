@@ -7,8 +7,12 @@ use crate::io::counters::{ByReason, Counters};
 use crate::io::document::PosteriorDocument;
 use crate::types::Label;
 use crate::types::posterior::{
-    EdgePosterior, InformedBy, JointTypeProbabilities, ObjectPosterior, Quantity, WindowRecord,
+    Criticism, EdgePosterior, InformedBy, JointTypeProbabilities, ObjectPosterior, Quantity, ResidualScore, Verdict,
+    WindowRecord,
 };
+
+/// Longer lists of an effect's parameters (tables) are cut.
+const MOST_PARAMETERS: usize = 8;
 
 /// A run, as the table tells it.
 #[derive(Clone, Copy, Debug)]
@@ -69,6 +73,7 @@ pub fn table(run: &Run<'_>) -> String {
             &format!("{parts} {} never moved: a joint on {them} is shown as on the root.", list.join(", ")),
         );
     }
+    criticism_lines(&mut text, &posterior.criticism);
     line(&mut text, "");
     line(&mut text, &windows_line(&posterior.windows, run.stream_s, run.wall_s));
     counter_lines(&mut text, &run.document.counters);
@@ -144,6 +149,44 @@ pub(super) fn significant(x: f64) -> String {
     }
 }
 
+/// What was found beyond the declared physics, and how well windows were predicted before and after.
+fn criticism_lines(text: &mut String, criticism: &Criticism) {
+    let verdict = match criticism.verdict {
+        Verdict::Adequate => "the model explains what was seen",
+        Verdict::EffectFound => "the model lacked an effect, which was found",
+        Verdict::Unexplained => "something is left that no known effect explains",
+        Verdict::Insufficient => return,
+    };
+    line(text, "");
+    line(text, &format!("Criticism: {verdict}."));
+    for effect in &criticism.effects {
+        let place = effect.label.map_or_else(|| "the sensor".to_owned(), |label| format!("part {label}"));
+        line(text, &format!("{} on {place}, probability {:.3}", effect.name, effect.probability));
+        if !effect.indistinguishable_from.is_empty() {
+            line(text, &format!("    or {}", effect.indistinguishable_from.join(", ")));
+        }
+        for (name, quantity) in effect.parameters.iter().take(MOST_PARAMETERS) {
+            line(text, &format!("    {name:<16}{}", interval(quantity)));
+        }
+        if effect.parameters.len() > MOST_PARAMETERS {
+            line(text, &format!("    and {} more", effect.parameters.len() - MOST_PARAMETERS));
+        }
+    }
+    for after in &criticism.after {
+        let Some(before) = criticism.before.iter().find(|before| before.label == after.label) else { continue };
+        let force = |score: &ResidualScore| match (score.force_rmse_n, score.torque_rmse_nm) {
+            (Some(force), _) => format!("{} N", significant(force)),
+            (_, Some(torque)) => format!("{} N·m", significant(torque)),
+            _ => "-".to_owned(),
+        };
+        let both = |score: &ResidualScore| format!("{}, {} mm", force(score), significant(1e3 * score.position_rmse_m));
+        let change = if before == after { both(after) } else { format!("{} -> {}", both(before), both(after)) };
+        let count = after.scored_windows;
+        let plural = if count == 1 { "" } else { "s" };
+        line(text, &format!("part {}: residual over {count} window{plural} {change}", after.label));
+    }
+}
+
 fn windows_line(windows: &[WindowRecord], stream_s: f64, wall_s: f64) -> String {
     let speed =
         format!("{stream_s:.1} s of stream in {wall_s:.1} s: {:.1} times real time", stream_s / wall_s.max(1e-9));
@@ -193,7 +236,7 @@ fn counter_lines(text: &mut String, counters: &Counters) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::types::posterior::{Criticism, PrismaticAxis, RevoluteAxis};
+    use crate::types::posterior::{PrismaticAxis, RevoluteAxis};
 
     const OPEN: JointTypeProbabilities = JointTypeProbabilities::UNIFORM;
     const HINGE: JointTypeProbabilities = JointTypeProbabilities { rigid: 0.0, prismatic: 0.004, revolute: 0.996 };

@@ -135,7 +135,11 @@ impl TrackedMechanism {
         let whole = self.trees.clone();
         let trees = TreeFamily::new(move |numbers| {
             let mut tree = (whole.0)(numbers)?;
-            (0..tree.body_count()).for_each(|body| tree.parameters_mut(body).effects.clear());
+            (0..tree.body_count()).for_each(|body| {
+                let parameters = tree.parameters_mut(body);
+                parameters.effects.clear();
+                parameters.tables.clear();
+            });
             Some(tree)
         });
         Some(Self { tree: trees.tree(&self.numbers)?, trees, ..self.clone() })

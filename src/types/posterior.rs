@@ -59,7 +59,26 @@ impl ObjectPosterior {
                 axis.covariance = (basis * Matrix2::from(axis.covariance) * basis.transpose()).into();
             }
         }
+        for effect in &mut self.criticism.effects {
+            for names in [["force_x", "force_y", "force_z"], ["torque_x", "torque_y", "torque_z"]] {
+                turn_vector(&mut effect.parameters, &names, &rotation);
+            }
+        }
         self
+    }
+}
+
+/// Turns a vector of normal quantities; its components' errors count as independent.
+fn turn_vector(parameters: &mut BTreeMap<String, Quantity>, names: &[&str; 3], rotation: &Matrix3<f64>) {
+    let old: Vec<Quantity> = names.iter().filter_map(|name| parameters.get(*name).cloned()).collect();
+    if old.len() != 3 {
+        return;
+    }
+    let mean = rotation * Vector3::from_fn(|i, _| old[i].mean);
+    let variance = rotation.map(|r| r * r) * Vector3::from_fn(|i, _| old[i].std * old[i].std);
+    for (i, name) in names.iter().enumerate() {
+        let turned = Quantity::from_normal(&old[i].unit, mean[i], variance[i].sqrt(), old[i].informed_by);
+        parameters.insert((*name).to_owned(), turned);
     }
 }
 

@@ -11,7 +11,7 @@ impl Effect for Impulse {
     const NAME: &'static str = "impulse";
     const PARAMETERS: &'static [Parameter] = &[
         Parameter::signed("start", Dimension::Time, 0.5, 0.3),
-        Parameter::positive("span", Dimension::Time, 0.1, 0.7),
+        Parameter::positive("span", Dimension::Time, 0.02, 1.0),
         Parameter::signed("force", Dimension::Force, 0.0, 1.0),
     ];
 
@@ -40,7 +40,7 @@ mod tests {
             let total: f64 = (0..(3.0_f64 / step_s) as usize)
                 .map(|i| {
                     let time_s = (i as f64 + 0.5) * step_s;
-                    let joint = JointState { position: 0.0, rate: 0.0, time_s, step_s };
+                    let joint = JointState { position: 0.0, rate: 0.0, acceleration: 0.0, time_s, step_s };
                     Impulse::force(&[1.0003, 0.01, 5.0], &joint) * step_s
                 })
                 .sum();

@@ -15,6 +15,7 @@ mod self_closing;
 mod soft_close;
 mod spring;
 mod stribeck;
+mod table;
 
 pub use asymmetric_friction::AsymmetricFriction;
 pub use catch::Catch;
@@ -28,6 +29,7 @@ pub use self_closing::SelfClosing;
 pub use soft_close::SoftClose;
 pub use spring::Spring;
 pub use stribeck::Stribeck;
+pub use table::{AttachedTable, TableKind};
 
 use serde::{Deserialize, Serialize};
 
@@ -45,6 +47,8 @@ pub struct JointState<T: Real> {
     pub position: T,
     /// v or q̇ \[m/s or rad/s\].
     pub rate: T,
+    /// q̈ as of the step before \[m/s² or rad/s²\].
+    pub acceleration: T,
     /// Middle of the step \[s\].
     pub time_s: f64,
     /// Length of the step \[s\], for what lasts no longer than one.
@@ -165,7 +169,8 @@ impl<T: Real> AttachedEffect<T> {
     pub fn apply(&self, joint: &JointState<T>, forces: JointForces<T>) -> JointForces<T> {
         let distance = joint.position - self.reference;
         let (opening, declared) = if self.reversed {
-            let opening = JointState { position: -distance, rate: -joint.rate, ..*joint };
+            let opening =
+                JointState { position: -distance, rate: -joint.rate, acceleration: -joint.acceleration, ..*joint };
             (opening, forces.friction.reversed())
         } else {
             (JointState { position: distance, ..*joint }, forces.friction)
@@ -228,7 +233,13 @@ mod tests {
                         for (i, parameter) in kind.parameters().iter().enumerate() {
                             effect.parameters[i] = parameter.physical(x[i], &SCALES);
                         }
-                        let joint = JointState { position: x[4], rate: x[5], time_s: 1.9, step_s: 1e-3 };
+                        let joint = JointState {
+                            position: x[4],
+                            rate: x[5],
+                            acceleration: Dual::constant(0.0),
+                            time_s: 1.9,
+                            step_s: 1e-3,
+                        };
                         let declared = JointForces {
                             force: Dual::constant(0.0),
                             damping: Dual::constant(2.0),
@@ -257,7 +268,7 @@ mod tests {
             };
             let reversed = JointForces { friction: declared.friction.reversed(), ..declared };
             for (position, rate) in STATES {
-                let joint = JointState { position, rate, time_s: 1.9, step_s: 1e-3 };
+                let joint = JointState { position, rate, acceleration: 0.0, time_s: 1.9, step_s: 1e-3 };
                 let mirror = JointState { position: -position, rate: -rate, ..joint };
                 let force = plain.added_force(&joint, &declared);
                 assert!((force + mirrored.added_force(&mirror, &reversed)).abs() < 1e-12);

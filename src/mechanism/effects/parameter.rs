@@ -1,10 +1,12 @@
 //! Parameters of effects: dimension, unit, and how a standard normal θ becomes a physical value.
 
+use serde::{Deserialize, Serialize};
+
 use super::super::joint::JointType;
 use crate::math::Real;
 
 /// The sizes that make priors dimensionless, taken from the data or the setting.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Scales {
     /// Of the generalized force on the joint \[N or N·m\].
     pub force: f64,
@@ -31,6 +33,8 @@ pub enum Dimension {
     Damping,
     /// N·s²/m² or N·m·s²/rad².
     Drag,
+    /// kg or kg·m².
+    Inertia,
     /// rad, of a periodic law.
     Phase,
     /// s.
@@ -84,6 +88,13 @@ impl Dimension {
                     "N·s²/m²"
                 }
             }
+            Self::Inertia => {
+                if turns {
+                    "kg·m²"
+                } else {
+                    "kg"
+                }
+            }
             Self::Phase => "rad",
             Self::Time => "s",
         }
@@ -98,6 +109,8 @@ impl Dimension {
             Self::Stiffness => scales.force / scales.position,
             Self::Damping => scales.force / scales.rate,
             Self::Drag => scales.force / (scales.rate * scales.rate),
+            // A rate is reached in about half a second.
+            Self::Inertia => 0.5 * scales.force / scales.rate,
             Self::Phase => 1.0,
             Self::Time => scales.duration_s,
         }

@@ -9,14 +9,14 @@
 //! The state holds the contact point's constant error beside (q, q̇). Derivatives are for fixed gains,
 //! by forward mode for one joint.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DVector, Vector3};
 use num_dual::DualSVec64;
 
-use super::layout::Mechanism;
-use super::track::{CONTACT_DEVIATION, JointTrack, Observation};
+use super::layout::{Mechanism, SensorError};
+use super::track::{CONTACT_DEVIATION, Drive, JointTrack, Observation};
 use crate::inference::Failure;
 use crate::math::Real;
-use crate::mechanism::{Spatial, State, Tree, WrenchSample, WrenchTrack, rollout};
+use crate::mechanism::{Spatial, State, Tree, WrenchPoint, WrenchSample, WrenchTrack, rollout};
 use crate::model::Axis;
 
 /// Longest step of the simulation \[s\]: half a wrench sample; trajectories of the midpoint step
@@ -62,6 +62,16 @@ pub struct Gain {
     deviation: DMatrix<f64>,
 }
 
+/// One observation of the filter: before it and after it.
+pub(super) struct FilterStep {
+    pub(super) predicted: DVector<f64>,
+    pub(super) predicted_covariance: DMatrix<f64>,
+    pub(super) updated: DVector<f64>,
+    pub(super) updated_covariance: DMatrix<f64>,
+    /// Of the state from the observation before.
+    pub(super) transition: DMatrix<f64>,
+}
+
 /// Innovations of a window.
 #[derive(Clone, Debug, Default)]
 pub struct Innovations {
@@ -88,17 +98,23 @@ const CHUNK: usize = 6;
 /// 60 ms a window in copies, one more simulation .3 ms; away from switches the two agree to 1e-5.
 const DIFFERENCE: f64 = 1e-6;
 
-/// A tree with derivatives along some of the directions: first parameters, then q, then q̇.
+/// What a simulation needs of the parameters.
+pub(super) struct Plant<T: Real> {
+    pub(super) tree: Tree<T>,
+    sensor: SensorError<T>,
+}
+
+/// A plant with derivatives along some of the directions: first parameters, then q, then q̇.
 struct Chunk {
-    tree: Tree<DualSVec64<CHUNK>>,
+    plant: Plant<DualSVec64<CHUNK>>,
     first: usize,
 }
 
 /// How the derivatives of a span are taken.
 enum Slopes {
     Forward(Vec<Chunk>),
-    /// The tree, and one for each parameter moved by [`DIFFERENCE`].
-    Differences(Tree<f64>, Vec<Tree<f64>>),
+    /// The plant, and one for each parameter moved by [`DIFFERENCE`].
+    Differences(Plant<f64>, Vec<Plant<f64>>),
 }
 
 impl WindowModel<'_> {
@@ -115,12 +131,7 @@ impl WindowModel<'_> {
         let mut state = self.first_state();
         let size = 2 * n + CONTACT;
         let mut slopes = DMatrix::zeros(size, p);
-        let deviation = |i: usize| match i {
-            i if i < n => FIRST_POSITION,
-            i if i < 2 * n => FIRST_RATE.hypot(FIRST_RATE_SHARE * state[i]),
-            _ => CONTACT_DEVIATION,
-        };
-        let mut covariance = DMatrix::from_fn(size, size, |i, j| if i == j { deviation(i).powi(2) } else { 0.0 });
+        let mut covariance = self.first_covariance(&state);
         let mut result = Innovations::default();
         for (k, observation) in observations.iter().enumerate() {
             if k > 0 {
@@ -135,7 +146,7 @@ impl WindowModel<'_> {
                 own += derivatives.columns(0, p);
                 covariance = &transition * covariance * transition.transpose();
                 let mut own = covariance.view_mut((0, 0), (2 * n, 2 * n));
-                own += noise.over(span, &self.all_positions(&state), self)?;
+                own += noise.over(span, &self.all_positions(state.as_slice()), self)?;
             }
             let rows = state_rows(observation);
             let innovation = &observation.value - &rows * &state;
@@ -165,16 +176,69 @@ impl WindowModel<'_> {
         }
     }
 
+    /// The filter alone, step by step.
+    pub(super) fn filtered(&self, x: &[f64]) -> Result<Vec<FilterStep>, Failure> {
+        let n = self.moving.len();
+        let size = 2 * n + CONTACT;
+        let slopes = if n > 1 { self.differences(x, &[])? } else { self.forward(x, &[])? };
+        let noise = ProcessNoise::new(self, x)?;
+        let mut predicted = self.first_state();
+        let mut covariance = self.first_covariance(&predicted);
+        let mut transition = DMatrix::identity(size, size);
+        let mut steps: Vec<FilterStep> = Vec::new();
+        let mut before_s = None;
+        for observation in &self.track.observations {
+            if let (Some(from_s), Some(last)) = (before_s, steps.last()) {
+                let span = [from_s, observation.time_s];
+                let moved = last.updated.rows(0, 2 * n).into_owned();
+                let (next, derivatives) = self.advance_with_slopes(&slopes, &moved, span, 0)?;
+                predicted.copy_from(&last.updated);
+                predicted.rows_mut(0, 2 * n).copy_from(&next);
+                transition.view_mut((0, 0), (2 * n, 2 * n)).copy_from(&derivatives.columns(0, 2 * n));
+                covariance = &transition * &last.updated_covariance * transition.transpose();
+                let mut own = covariance.view_mut((0, 0), (2 * n, 2 * n));
+                own += noise.over(span, &self.all_positions(predicted.as_slice()), self)?;
+            }
+            let rows = state_rows(observation);
+            let innovation = &observation.value - &rows * &predicted;
+            let spread = &covariance * rows.transpose();
+            let total = &rows * &spread + DMatrix::identity(n, n);
+            let gain = total.cholesky().ok_or(Failure::Diverged)?.solve(&spread.transpose()).transpose();
+            let updated_covariance = &covariance - &gain * spread.transpose();
+            steps.push(FilterStep {
+                updated: &predicted + &gain * innovation,
+                updated_covariance: (&updated_covariance + updated_covariance.transpose()) * 0.5,
+                predicted: predicted.clone(),
+                // Never singular, where a joint sticks.
+                predicted_covariance: &covariance + DMatrix::identity(size, size) * 1e-14,
+                transition: transition.clone(),
+            });
+            before_s = Some(observation.time_s);
+        }
+        if steps.len() < 3 { Err(Failure::NoInformation) } else { Ok(steps) }
+    }
+
+    fn first_covariance(&self, state: &DVector<f64>) -> DMatrix<f64> {
+        let n = self.moving.len();
+        let deviation = |i: usize| match i {
+            i if i < n => FIRST_POSITION,
+            i if i < 2 * n => FIRST_RATE.hypot(FIRST_RATE_SHARE * state[i]),
+            _ => CONTACT_DEVIATION,
+        };
+        let size = 2 * n + CONTACT;
+        DMatrix::from_fn(size, size, |i, j| if i == j { deviation(i).powi(2) } else { 0.0 })
+    }
+
     /// Whitened innovations at `x` with gains from elsewhere.
     pub fn residuals(&self, x: &[f64], gains: &[Gain]) -> Result<Vec<f64>, Failure> {
         let n = self.moving.len();
-        let tree = self.mechanism.tree(x, self.axes, self.frozen)?;
+        let plant = self.plant(x)?;
         let mut state = self.first_state();
         let mut all = Vec::with_capacity(n * gains.len());
         for (k, (observation, Gain { gain, deviation })) in self.track.observations.iter().zip(gains).enumerate() {
             if k > 0 {
                 let span = [self.track.observations[k - 1].time_s, observation.time_s];
-                let run = self.advance(&tree, &state.as_slice()[..2 * n], span)?;
+                let run = self.advance(&plant, &state.as_slice()[..2 * n], span)?;
                 state.rows_mut(0, 2 * n).copy_from_slice(&run);
             }
             let innovation = &observation.value - state_rows(observation) * &state;
@@ -183,6 +247,11 @@ impl WindowModel<'_> {
             state += gain * innovation;
         }
         if all.iter().all(|e: &f64| e.is_finite()) { Ok(all) } else { Err(Failure::Diverged) }
+    }
+
+    pub(super) fn plant<T: Real>(&self, x: &[T]) -> Result<Plant<T>, Failure> {
+        let tree = self.mechanism.tree(x, self.axes, self.frozen)?;
+        Ok(Plant { tree, sensor: self.mechanism.sensor_error(x) })
     }
 
     fn forward(&self, x: &[f64], active: &[usize]) -> Result<Slopes, Failure> {
@@ -194,7 +263,7 @@ impl WindowModel<'_> {
                     parameters[at] = parameters[at].derivative(i - first);
                 }
             }
-            Ok(Chunk { tree: self.mechanism.tree(&parameters, self.axes, self.frozen)?, first })
+            Ok(Chunk { plant: self.plant(&parameters)?, first })
         });
         Ok(Slopes::Forward(chunks.collect::<Result<_, Failure>>()?))
     }
@@ -203,10 +272,10 @@ impl WindowModel<'_> {
         let moved = active.iter().map(|&at| {
             let mut moved = x.to_vec();
             moved[at] += DIFFERENCE;
-            self.mechanism.tree(&moved, self.axes, self.frozen)
+            self.plant(&moved)
         });
         let moved = moved.collect::<Result<_, Failure>>()?;
-        Ok(Slopes::Differences(self.mechanism.tree(x, self.axes, self.frozen)?, moved))
+        Ok(Slopes::Differences(self.plant(x)?, moved))
     }
 
     /// The state after a span, and its derivatives by parameters and by the state before.
@@ -219,21 +288,21 @@ impl WindowModel<'_> {
     ) -> Result<(DVector<f64>, DMatrix<f64>), Failure> {
         let chunks = match slopes {
             Slopes::Forward(chunks) => chunks,
-            Slopes::Differences(tree, moved) => {
-                let after = DVector::from_vec(self.advance(tree, state.as_slice(), span)?);
+            Slopes::Differences(plant, moved) => {
+                let after = DVector::from_vec(self.advance(plant, state.as_slice(), span)?);
                 let mut derivatives = DMatrix::zeros(state.len(), p + state.len());
-                let mut slope = |column: usize, tree: &Tree<f64>, start: &DVector<f64>| -> Result<(), Failure> {
-                    let end = DVector::from_vec(self.advance(tree, start.as_slice(), span)?);
+                let mut slope = |column: usize, plant: &Plant<f64>, start: &DVector<f64>| -> Result<(), Failure> {
+                    let end = DVector::from_vec(self.advance(plant, start.as_slice(), span)?);
                     derivatives.set_column(column, &((end - &after) / DIFFERENCE));
                     Ok(())
                 };
-                for (column, tree) in moved.iter().enumerate() {
-                    slope(column, tree, state)?;
+                for (column, plant) in moved.iter().enumerate() {
+                    slope(column, plant, state)?;
                 }
                 for i in 0..state.len() {
                     let mut start = state.clone();
                     start[i] += DIFFERENCE;
-                    slope(p + i, tree, &start)?;
+                    slope(p + i, plant, &start)?;
                 }
                 return Ok((after, derivatives));
             }
@@ -251,7 +320,7 @@ impl WindowModel<'_> {
                     }
                 })
                 .collect();
-            for (i, value) in self.advance(&chunk.tree, &start, span)?.iter().enumerate() {
+            for (i, value) in self.advance(&chunk.plant, &start, span)?.iter().enumerate() {
                 after[i] = value.re;
                 if let Some(eps) = &value.eps.0 {
                     for direction in 0..CHUNK.min(p + size - chunk.first) {
@@ -264,7 +333,30 @@ impl WindowModel<'_> {
     }
 
     /// (q, q̇) of the moving joints after a span.
-    fn advance<T: Real>(&self, tree: &Tree<T>, state: &[T], span: [f64; 2]) -> Result<Vec<T>, Failure> {
+    pub(super) fn advance<T: Real>(&self, plant: &Plant<T>, state: &[T], span: [f64; 2]) -> Result<Vec<T>, Failure> {
+        // The sensor's errors act while the tool does, so a span in which contact begins or ends is cut.
+        let delay_s = plant.sensor.delay_s.value();
+        let ends = |drive: &Drive| {
+            let samples = &drive.samples;
+            (drive.tool && samples.len() > 4 && self.mechanism.sensor.bias)
+                .then(|| [samples[1].stamp_s - delay_s, samples[samples.len() - 2].stamp_s - delay_s])
+        };
+        let contacts: Vec<Option<[f64; 2]>> = self.track.drives.iter().map(ends).collect();
+        let within = |t: &f64| *t > span[0] + 1e-6 && *t < span[1] - 1e-6;
+        if let Some(cut) = contacts.iter().flatten().flatten().copied().find(|t| within(t)) {
+            let middle = self.advance_evenly(plant, state, [span[0], cut], &contacts)?;
+            return self.advance_evenly(plant, &middle, [cut, span[1]], &contacts);
+        }
+        self.advance_evenly(plant, state, span, &contacts)
+    }
+
+    fn advance_evenly<T: Real>(
+        &self,
+        Plant { tree, sensor }: &Plant<T>,
+        state: &[T],
+        span: [f64; 2],
+        contacts: &[Option<[f64; 2]>],
+    ) -> Result<Vec<T>, Failure> {
         let n = self.moving.len();
         let mut positions = vec![T::zero(); self.mechanism.joints.len()];
         let mut rates = positions.clone();
@@ -272,8 +364,26 @@ impl WindowModel<'_> {
             positions[joint] = state[i];
             rates[joint] = state[n + i];
         }
-        let tracks: Vec<WrenchTrack<'_, T>> =
-            self.track.drives.iter().map(|d| WrenchTrack::new(d.joint, within(&d.samples, span))).collect();
+        let middle_s = 0.5 * (span[0] + span[1]);
+        let delay_s = sensor.delay_s.value();
+        let drives = self.track.drives.iter().zip(contacts);
+        let tracks: Vec<WrenchTrack<'_, T>> = drives
+            .filter(|(_, contact)| contact.is_none_or(|[from, to]| middle_s > from && middle_s < to))
+            .map(|(drive, contact)| {
+                // Where a bias counts, the zeros about the contact do not.
+                let last = drive.samples.len();
+                let all = if contact.is_some() { &drive.samples[1..last - 1] } else { &drive.samples[..] };
+                let bias = |of: Vector3<T>| if drive.tool { of } else { Vector3::zeros() };
+                WrenchTrack {
+                    body: drive.joint,
+                    samples: within(all, [span[0] + delay_s, span[1] + delay_s]),
+                    point: WrenchPoint::Recorded,
+                    delay_s: sensor.delay_s,
+                    force_bias: bias(sensor.force_bias),
+                    torque_bias: bias(sensor.torque_bias),
+                }
+            })
+            .collect();
         let step_s = if n > 1 { CHAIN_STEP_S } else { STEP_S };
         let run =
             rollout(tree, &State::new(positions, rates), &tracks, &span, step_s).map_err(|_| Failure::Diverged)?;
@@ -281,7 +391,8 @@ impl WindowModel<'_> {
         Ok(self.moving.iter().map(|&j| positions[j]).chain(self.moving.iter().map(|&j| rates[j])).collect())
     }
 
-    fn all_positions(&self, state: &DVector<f64>) -> Vec<f64> {
+    /// Positions of all joints, those of the moving ones from a state; the others' are in the tree.
+    pub(super) fn all_positions(&self, state: &[f64]) -> Vec<f64> {
         let mut positions = vec![0.0; self.mechanism.joints.len()];
         for (i, &joint) in self.moving.iter().enumerate() {
             positions[joint] = state[i];

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use crate::geometry::HullProperties;
 use crate::inference::{Failure, Gaussian};
 use crate::math::{Pose, Real, Screw, orthonormal_pair};
-use crate::mechanism::effects::{AttachedEffect, EffectKind, Scales};
+use crate::mechanism::effects::{AttachedEffect, AttachedTable, EffectKind, Scales, TableKind};
 use crate::mechanism::{Body, JointParameters, JointType, Limit, Tree};
 use crate::model::{Axis, KinematicJoint};
 
@@ -51,13 +51,74 @@ const LOG_FORCE_DEVIATION: f64 = 1.5;
 /// Standard deviation of an end stop about where the joint was seen to halt \[m or rad\].
 pub const LIMIT_DEVIATION: f64 = 0.01;
 
-/// Typical force and rate of a joint, from the first window in which it moved.
+/// Typical force and rate of a joint, and how far it goes, from the first window in which it moved.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct JointScales {
     /// \[N or N·m\].
     pub force: f64,
     /// \[m/s or rad/s\].
     pub rate: f64,
+    /// From the reference position towards the opened one, negative where q falls \[m or rad\].
+    pub travel: f64,
+}
+
+/// A named effect beyond the declared model.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct AddedEffect {
+    /// Which.
+    pub kind: EffectKind,
+    /// What its prior is scaled by.
+    pub scales: Scales,
+    /// The joint position where x = 0 \[m or rad\].
+    pub reference: f64,
+    /// Whether the joint opens as q falls.
+    pub reversed: bool,
+}
+
+/// A tabulated effect: what has no name, or what names are compared with.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct AddedTable {
+    /// What is tabulated over what.
+    pub kind: TableKind,
+    /// Arguments, ascending.
+    pub nodes: Vec<f64>,
+    /// Standard deviation of an entry by the prior, in the units of the entries.
+    pub scale: f64,
+    /// Over this distance entries are alike, in the units of the nodes.
+    pub correlation: f64,
+    /// Whether the joint opens as q falls.
+    pub reversed: bool,
+}
+
+/// Which errors of the wrench sensor the model has.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SensorModel {
+    /// A constant added to force and torque.
+    pub bias: bool,
+    /// The report acts earlier or later than it says.
+    pub delay: bool,
+    /// Standard deviations by the prior: force \[N\], torque \[N·m\], delay \[s\].
+    pub scales: [f64; 3],
+}
+
+impl Default for SensorModel {
+    fn default() -> Self {
+        Self { bias: false, delay: false, scales: [1.0, 0.2, 0.05] }
+    }
+}
+
+/// Numbers of the sensor: force bias, torque bias, delay, in units of their scales.
+pub const SENSOR_SIZE: usize = 7;
+
+/// What the sensor's numbers mean.
+#[derive(Clone, Copy, Debug)]
+pub struct SensorError<T: Real> {
+    /// What it adds to the force \[N\].
+    pub force_bias: Vector3<T>,
+    /// What it adds to the torque \[N·m\].
+    pub torque_bias: Vector3<T>,
+    /// δ: the wrench acting at t is the one reported at t + δ \[s\].
+    pub delay_s: T,
 }
 
 /// All that is fixed of one joint and its body.
@@ -75,19 +136,44 @@ pub struct JointModel {
     pub center_shows: bool,
     /// The two directions of the centre of mass.
     pub center_basis: [Vector3<f64>; 2],
-    /// Effects beyond the declared model, whose numbers follow the declared ones.
-    pub effects: Vec<EffectKind>,
+    /// Whether Coulomb friction is in the model.
+    pub friction: bool,
+    /// Effects beyond that, whose numbers follow.
+    pub effects: Vec<AddedEffect>,
+    /// Tables, whose entries follow those, in units of their scales.
+    pub tables: Vec<AddedTable>,
 }
 
 impl JointModel {
     /// How many numbers the joint has.
     pub fn size(&self) -> usize {
-        SIZE + self.effects.iter().map(|kind| kind.parameters().len()).sum::<usize>()
+        let effects: usize = self.effects.iter().map(|effect| effect.kind.parameters().len()).sum();
+        SIZE + effects + self.tables.iter().map(|table| table.nodes.len()).sum::<usize>()
+    }
+
+    /// First number of an effect.
+    pub fn effect_offset(&self, effect: usize) -> usize {
+        SIZE + self.effects[..effect].iter().map(|effect| effect.kind.parameters().len()).sum::<usize>()
+    }
+
+    /// First number of a table.
+    pub fn table_offset(&self, table: usize) -> usize {
+        let before: usize = self.tables[..table].iter().map(|table| table.nodes.len()).sum();
+        self.effect_offset(self.effects.len()) + before
     }
 
     /// The numbers that the equations of motion hold.
     pub fn active(&self) -> Vec<usize> {
-        let mut active = vec![DAMPING, FRICTION, INERTIA];
+        // Friction and damping by direction stand in the place of the declared ones.
+        let by_direction = self.effects.iter().any(|effect| effect.kind == EffectKind::AsymmetricFriction);
+        let mut active = vec![INERTIA];
+        if !by_direction {
+            active.push(DAMPING);
+        }
+        if !by_direction && self.friction {
+            active.push(FRICTION);
+        }
+        active.sort_unstable();
         active.extend([LOWER, UPPER].into_iter().zip(self.stops).filter(|(_, there)| *there).map(|(i, _)| i));
         if self.center_shows && self.joint.joint_type == JointType::Revolute {
             active.push(MASS);
@@ -152,7 +238,16 @@ impl JointModel {
             let spread = self.hull.spread.dot(&basis.abs()).max(0.01);
             map[(CENTER + i, CENTER + i)] = guess.map_or(CENTER_DEVIATION * spread, |(_, _, center)| center);
         }
-        Gaussian::from_moments(&mean, &(&map * map.transpose()))
+        let mut covariance = &map * map.transpose();
+        for (i, table) in self.tables.iter().enumerate() {
+            let first = self.table_offset(i);
+            for (a, node) in table.nodes.iter().enumerate() {
+                for (b, other) in table.nodes.iter().enumerate().filter(|(b, _)| *b != a) {
+                    covariance[(first + a, first + b)] = (-(node - other).abs() / table.correlation).exp();
+                }
+            }
+        }
+        Gaussian::from_moments(&mean, &covariance)
     }
 
     /// The body's inertial properties at the reference configuration from the joint's numbers.
@@ -178,16 +273,30 @@ impl JointModel {
     }
 
     fn parameters<T: Real>(&self, x: &[T]) -> JointParameters<T> {
-        let mut parameters = JointParameters::new(x[DAMPING].exp(), x[FRICTION].exp());
+        let friction = if self.friction { x[FRICTION].exp() } else { T::zero() };
+        let mut parameters = JointParameters::new(x[DAMPING].exp(), friction);
         parameters.lower = self.stops[0].then(|| Limit::at(x[LOWER]));
         parameters.upper = self.stops[1].then(|| Limit::at(x[UPPER]));
-        let scales = Scales { force: self.scales.force, rate: self.scales.rate, position: 0.3, duration_s: 4.0 };
         let mut at = SIZE;
-        for kind in &self.effects {
-            let values: Vec<T> =
-                kind.parameters().iter().enumerate().map(|(i, p)| p.physical(x[at + i], &scales)).collect();
+        for effect in &self.effects {
+            let laws = effect.kind.parameters().iter().enumerate();
+            let values: Vec<T> = laws.map(|(i, p)| p.physical(x[at + i], &effect.scales)).collect();
             at += values.len();
-            parameters.effects.push(AttachedEffect::new(*kind, &values));
+            parameters.effects.push(AttachedEffect {
+                reference: T::constant(effect.reference),
+                reversed: effect.reversed,
+                ..AttachedEffect::new(effect.kind, &values)
+            });
+        }
+        for table in &self.tables {
+            let entries = &x[at..at + table.nodes.len()];
+            at += entries.len();
+            parameters.tables.push(AttachedTable {
+                kind: table.kind,
+                nodes: table.nodes.as_slice().into(),
+                values: entries.iter().map(|&entry| entry * T::constant(table.scale)).collect(),
+                reversed: table.reversed,
+            });
         }
         parameters
     }
@@ -200,12 +309,40 @@ pub struct Mechanism {
     pub joints: Vec<JointModel>,
     /// \[m/s²\].
     pub gravity: Vector3<f64>,
+    /// Errors of the wrench sensor, whose numbers follow those of the joints.
+    pub sensor: SensorModel,
 }
 
 impl Mechanism {
     /// First number of a joint.
     pub fn offset(&self, joint: usize) -> usize {
         self.joints[..joint].iter().map(JointModel::size).sum()
+    }
+
+    /// How many numbers there are.
+    pub fn size(&self) -> usize {
+        self.offset(self.joints.len()) + SENSOR_SIZE
+    }
+
+    /// The sensor's numbers that the model has, counted from the sensor's first.
+    pub fn active_sensor(&self) -> Vec<usize> {
+        let bias = (0..6).filter(|_| self.sensor.bias);
+        bias.chain((6..7).filter(|_| self.sensor.delay)).collect()
+    }
+
+    /// The sensor's errors; none where the model has none.
+    pub fn sensor_error<T: Real>(&self, x: &[T]) -> SensorError<T> {
+        let first = self.offset(self.joints.len());
+        let [force, torque, delay] = self.sensor.scales;
+        let entry = |i: usize, scale: f64, there: bool| {
+            let value = x.get(first + i).filter(|_| there);
+            value.map_or_else(T::zero, |&value| value * T::constant(scale))
+        };
+        SensorError {
+            force_bias: Vector3::from_fn(|i, _| entry(i, force, self.sensor.bias)),
+            torque_bias: Vector3::from_fn(|i, _| entry(3 + i, torque, self.sensor.bias)),
+            delay_s: entry(6, delay, self.sensor.delay),
+        }
     }
 
     /// The tree of one body per joint, at the configuration where the `frozen` joints are at their
@@ -283,7 +420,9 @@ pub fn joint_models(
                 stops: stops[k],
                 center_shows,
                 center_basis: [first, second],
+                friction: true,
                 effects: Vec::new(),
+                tables: Vec::new(),
             }
         })
         .collect()

@@ -5,12 +5,16 @@ use std::collections::BTreeMap;
 use nalgebra::{DMatrix, DVector, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::layout::{JointScales, LIMIT_DEVIATION, LOWER, Mechanism, UPPER, joint_models};
+use super::layout::{
+    AddedEffect, AddedTable, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism, SENSOR_SIZE, SIZE,
+    SensorModel, UPPER, joint_models,
+};
 use super::site::{FittedWindow, WindowFit, inertial_entries, load_factor};
 use super::track::{Drive, TrackKinematics, TrackSource, driven_labels, joint_track, touched_label};
 use crate::geometry::HullProperties;
 use crate::inference::{Belief, Factor, Failure, Gaussian, Joint};
 use crate::math::orthonormal_pair;
+use crate::mechanism::effects::{EffectKind, Scales};
 use crate::mechanism::{JointType, WrenchTrack};
 use crate::model::{Axis, Contact, KinematicFit, KinematicJoint, WindowObservations};
 use crate::types::{Label, Stamp};
@@ -23,6 +27,8 @@ const STEPS: usize = 14;
 const REVISIT_STEPS: usize = 12;
 /// A joint that stops at an end of its range stays there as long \[s\].
 const SHORTEST_HALT: f64 = 0.1;
+/// Effects in time are expected within a record of this length \[s\].
+const TYPICAL_RECORD_S: f64 = 4.0;
 /// A stop is believed if it raises the log evidence by this.
 const STOP_EVIDENCE: f64 = 4.0;
 
@@ -35,6 +41,8 @@ pub enum Block {
     Axis(Label),
     /// The tool's offset, as an error of the kinematic fit.
     ToolOffset,
+    /// Bias and delay of the wrench sensor.
+    Sensor,
 }
 
 /// What a site stands for.
@@ -66,18 +74,21 @@ pub struct WindowInference {
 
 /// What stays of a joint between windows.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-struct JointMemory {
+pub(super) struct JointMemory {
     signature: (JointType, Option<Label>, Vec<Label>),
     /// A fit that finds the axis the other way round counts positions the other way.
     direction: Vector3<f64>,
-    scales: Option<JointScales>,
-    stops: [bool; 2],
+    pub(super) scales: Option<JointScales>,
+    pub(super) stops: [bool; 2],
     /// Where the stops are expected, once they are believed.
-    stop_positions: [f64; 2],
+    pub(super) stop_positions: [f64; 2],
     center_basis: Option<[Vector3<f64>; 2]>,
     hull: Option<HullProperties>,
+    pub(super) friction: bool,
+    pub(super) effects: Vec<AddedEffect>,
+    pub(super) tables: Vec<AddedTable>,
     /// Least and greatest position in the windows gone by \[m or rad\].
-    reached: Option<(f64, f64)>,
+    pub(super) reached: Option<(f64, f64)>,
 }
 
 /// What stays of a window.
@@ -93,16 +104,50 @@ pub(super) struct WindowMemory {
     turn: usize,
 }
 
+impl WindowMemory {
+    /// The site was made with the axes and the offset of this fit.
+    pub(super) fn made_with(&mut self, fit: &KinematicFit) {
+        self.axes = fit.joints.iter().map(|j| (j.child, j.axis)).collect();
+        self.tool_offset = fit.tool_offset;
+    }
+}
+
+/// Where a fit starts: all numbers, and κ.
+pub(super) struct Warm {
+    pub(super) x: Vec<f64>,
+    pub(super) noise_scale: f64,
+}
+
 /// Learns the dynamics from windows, given the kinematic fit of all of them.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct DynamicsLearner {
     gravity: Vector3<f64>,
     pub(super) belief: Belief<Block, Site>,
-    joints: BTreeMap<Label, JointMemory>,
+    pub(super) joints: BTreeMap<Label, JointMemory>,
     pub(super) windows: Vec<WindowMemory>,
     /// Axes and offset that the sites of windows gone by are about.
     past: BTreeMap<Option<Label>, WindowMemory>,
     pub(super) mechanism: Mechanism,
+    pub(super) declared: DeclaredPhysics,
+    pub(super) sensor: SensorModel,
+    /// Of the sensor's numbers, by what it reads at rest.
+    pub(super) sensor_prior: Option<Gaussian>,
+}
+
+/// What is in the model of every joint from the start, beside rigid bodies, damping and end stops.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct DeclaredPhysics {
+    /// Coulomb friction.
+    pub friction: bool,
+    /// Effects by name.
+    pub effects: Vec<EffectKind>,
+}
+
+impl Default for DeclaredPhysics {
+    fn default() -> Self {
+        Self { friction: true, effects: Vec::new() }
+    }
 }
 
 /// A window as it comes.
@@ -128,8 +173,18 @@ impl DynamicsLearner {
             joints: BTreeMap::new(),
             windows: Vec::new(),
             past: BTreeMap::new(),
-            mechanism: Mechanism { joints: Vec::new(), gravity },
+            mechanism: Mechanism { joints: Vec::new(), gravity, sensor: SensorModel::default() },
+            declared: DeclaredPhysics::default(),
+            sensor: SensorModel::default(),
+            sensor_prior: None,
         }
+    }
+
+    /// The same with other physics declared; before the first window.
+    #[must_use]
+    pub fn declaring(mut self, declared: DeclaredPhysics) -> Self {
+        self.declared = declared;
+        self
     }
 
     /// Keeps a window in which no joint is known yet: it is learned with the first that follows.
@@ -165,7 +220,7 @@ impl DynamicsLearner {
     }
 
     /// Takes over the joints, axes and covariance of a kinematic fit.
-    fn follow(&mut self, fit: &KinematicFit, input: &DynamicsInput<'_>) -> Result<(), Failure> {
+    pub(super) fn follow(&mut self, fit: &KinematicFit, input: &DynamicsInput<'_>) -> Result<(), Failure> {
         let label_of = |k: usize| fit.joints[k].child;
         let mut present: Vec<Label> = Vec::new();
         for joint in &fit.joints {
@@ -191,6 +246,9 @@ impl DynamicsLearner {
                     stop_positions: [0.0; 2],
                     center_basis: None,
                     hull,
+                    friction: self.declared.friction,
+                    effects: Vec::new(),
+                    tables: Vec::new(),
                     reached: None,
                 };
                 self.joints.insert(joint.child, memory);
@@ -208,6 +266,7 @@ impl DynamicsLearner {
                 && let Some(memory) = self.joints.get_mut(&joint.child)
             {
                 memory.scales = Some(scales);
+                memory.effects.extend(self.declared.effects.iter().map(|kind| added_effect(*kind, &scales)));
             }
         }
         self.rebuild(fit)?;
@@ -243,6 +302,12 @@ impl DynamicsLearner {
     }
 
     fn forget(&mut self, label: Label) {
+        self.forget_sites(label);
+        self.belief.remove_prior(&Block::Dynamics(label));
+    }
+
+    /// Forgets what windows said of a joint.
+    pub(super) fn forget_sites(&mut self, label: Label) {
         for block in [Block::Dynamics(label), Block::Axis(label)] {
             for site in self.belief.drop_sites_of(&block) {
                 match site {
@@ -251,13 +316,12 @@ impl DynamicsLearner {
                 }
             }
         }
-        self.belief.remove_prior(&Block::Dynamics(label));
     }
 
     /// The mechanism of the current joints, and the priors of new ones.
-    fn rebuild(&mut self, fit: &KinematicFit) -> Result<(), Failure> {
+    pub(super) fn rebuild(&mut self, fit: &KinematicFit) -> Result<(), Failure> {
         let memory = |joint: &KinematicJoint| self.joints.get(&joint.child);
-        let default = JointScales { force: 1.0, rate: 0.2 };
+        let default = JointScales { force: 1.0, rate: 0.2, travel: 0.3 };
         let scales: Vec<_> = fit.joints.iter().map(|j| memory(j).and_then(|m| m.scales).unwrap_or(default)).collect();
         let stops: Vec<_> = fit.joints.iter().map(|j| memory(j).map_or([false; 2], |m| m.stops)).collect();
         let hull = |joint: &KinematicJoint| {
@@ -272,16 +336,22 @@ impl DynamicsLearner {
                 continue;
             };
             model.center_basis = *memory.center_basis.get_or_insert(model.center_basis);
+            model.friction = memory.friction;
+            model.effects.clone_from(&memory.effects);
+            model.tables.clone_from(&memory.tables);
             let block = Block::Dynamics(label);
             // The prior is made once; a stop that comes to be believed changes its own entries only.
             let gaussian = match self.belief.prior(&block) {
-                Some(old) => with_stops(&old.gaussian, memory),
+                Some(old) if old.gaussian.dimension() == model.size() => with_stops(&old.gaussian, memory),
+                Some(old) => extended(&with_stops(&old.gaussian, memory), model)?,
                 None => model.prior(memory.stop_positions)?,
             };
             let size = model.size();
             self.belief.set_prior(block, Factor { blocks: vec![(block, size)], gaussian });
         }
-        self.mechanism = Mechanism { joints: models, gravity: self.gravity };
+        self.mechanism = Mechanism { joints: models, gravity: self.gravity, sensor: self.sensor };
+        let sensor = self.sensor_prior.clone().map_or_else(standard_sensor, Ok)?;
+        self.belief.set_prior(Block::Sensor, Factor { blocks: vec![(Block::Sensor, SENSOR_SIZE)], gaussian: sensor });
         Ok(())
     }
 
@@ -334,7 +404,7 @@ impl DynamicsLearner {
                         }
                         memory.tool_offset = fit.tool_offset;
                     }
-                    Block::Dynamics(_) => {}
+                    Block::Dynamics(_) | Block::Sensor => {}
                 }
                 at += length;
             }
@@ -381,7 +451,7 @@ impl DynamicsLearner {
         (moving, frozen)
     }
 
-    fn source<'a>(
+    pub(super) fn source<'a>(
         &'a self,
         window: usize,
         moving: &'a [usize],
@@ -405,7 +475,7 @@ impl DynamicsLearner {
         let kinematics = kinematics_of(fit);
         (0..input.windows.len()).find_map(|w| {
             let (moving, _) = self.moving(w, fit, input);
-            let column = moving.iter().position(|&m| m == joint)?;
+            moving.iter().position(|&m| m == joint)?;
             let track = joint_track(&self.source(w, &moving, fit, input), &kinematics)?;
             let times = &input.windows[w].times_s;
             let positions = &fit.positions[w][joint];
@@ -415,8 +485,7 @@ impl DynamicsLearner {
             let rate = quantile(rates, 0.9)?.max(1e-3);
             let forces = self.generalized_forces(joint, fit, &track);
             let force = quantile(forces, 0.9).filter(|f| *f > 1e-3).unwrap_or(1.0);
-            let _ = column;
-            Some(JointScales { force, rate })
+            Some(JointScales { force, rate, travel: travel_of(positions) })
         })
     }
 
@@ -463,7 +532,8 @@ impl DynamicsLearner {
                 memory.stop_positions[side] = position;
             }
             self.rebuild(fit)?;
-            let trial = self.fit_window(window, fit, input, &moving, &frozen, (6, Some(&fitted.1)));
+            let warm = Warm { x: fitted.2.clone(), noise_scale: fitted.1.noise_scale };
+            let trial = self.fit_window(window, fit, input, &moving, &frozen, (6, Some(&warm)));
             spent += trial.as_ref().map_or(0, |t| t.1.steps);
             match trial {
                 Ok(trial) if trial.1.log_predictive > fitted.1.log_predictive + STOP_EVIDENCE => fitted = trial,
@@ -475,15 +545,14 @@ impl DynamicsLearner {
                 }
             }
         }
-        let (factor, result) = fitted;
+        let (factor, result, _) = fitted;
         self.belief.replace(Site::Window(window), factor);
         let turn = self.windows.len();
         let memory = &mut self.windows[window];
         memory.learned = true;
         memory.turn = turn;
         memory.noise_scale = Some(result.noise_scale);
-        memory.axes = fit.joints.iter().map(|j| (j.child, j.axis)).collect();
-        memory.tool_offset = fit.tool_offset;
+        memory.made_with(fit);
         let observations = result.innovations.whitened.len();
         let log_predictive = result.log_predictive - 0.5 * observations as f64 * std::f64::consts::TAU.ln();
         Ok(WindowInference {
@@ -558,15 +627,15 @@ impl DynamicsLearner {
     }
 
     /// Fits a window and makes its site.
-    fn fit_window(
+    pub(super) fn fit_window(
         &self,
         window: usize,
         fit: &KinematicFit,
         input: &DynamicsInput<'_>,
         moving: &[usize],
         frozen: &[Option<f64>],
-        (steps, warm): (usize, Option<&FittedWindow>),
-    ) -> Result<(Factor<Block>, FittedWindow), Failure> {
+        (steps, warm): (usize, Option<&Warm>),
+    ) -> Result<(Factor<Block>, FittedWindow, Vec<f64>), Failure> {
         let involved = self.involved(fit, moving);
         let cavity = self.belief.product(Some(&Site::Window(window)));
         let conditional = given_kinematics(&cavity, &self.blocks())?;
@@ -575,16 +644,27 @@ impl DynamicsLearner {
         let prior = conditional.marginal(active)?;
         let (start, covariance) = prior.moments()?;
         let starts = match warm {
-            Some(warm) => vec![DVector::from_fn(active.len(), |i, _| {
-                warm.active.iter().position(|a| *a == active[i]).map_or(start[i], |k| warm.solution.point[k])
-            })],
+            Some(warm) => {
+                vec![DVector::from_fn(active.len(), |i, _| warm.x.get(active[i]).copied().unwrap_or(start[i]))]
+            }
             None => starts(&start, &covariance, active, &self.mechanism, moving),
         };
         let noise_scale = warm.map(|w| w.noise_scale).or(self.windows[window].noise_scale);
         let fitted = window_fit.fit(&prior, &starts, noise_scale, steps)?;
         let deviations = self.deviations(fit, &involved, input.use_tool || !self.windows[window].contacts.is_empty());
         let sensitivity = window_fit.sensitivity(&fitted, &deviations);
-        Ok((self.factor(fit, &window_fit, &fitted, &sensitivity), fitted))
+        let factor = self.factor(fit, &window_fit, &fitted, &sensitivity);
+        let mut x = window_fit.base;
+        for (&at, value) in window_fit.active.iter().zip(fitted.solution.point.iter()) {
+            x[at] = *value;
+        }
+        Ok((factor, fitted, x))
+    }
+
+    /// The blocks of all numbers, in the order of the mechanism's layout.
+    pub(super) fn blocks(&self) -> Vec<Block> {
+        let joints = self.mechanism.joints.iter().map(|m| Block::Dynamics(m.joint.child));
+        joints.chain([Block::Sensor]).collect()
     }
 
     /// A window as it is fitted, from the mean of `conditional`: all dynamic numbers given the kinematics.
@@ -605,6 +685,8 @@ impl DynamicsLearner {
             let own = if whole { own } else { inertial_entries(&own) };
             active.extend(own.into_iter().map(|i| i + self.mechanism.offset(joint)));
         }
+        let sensor = self.mechanism.offset(self.mechanism.joints.len());
+        active.extend(self.mechanism.active_sensor().into_iter().map(|i| i + sensor));
         Ok(WindowFit {
             mechanism: &self.mechanism,
             source,
@@ -614,11 +696,6 @@ impl DynamicsLearner {
             active,
             base: conditional.moments()?.0.iter().copied().collect(),
         })
-    }
-
-    /// The blocks of all dynamic numbers, in the order of the mechanism's layout.
-    pub(super) fn blocks(&self) -> Vec<Block> {
-        self.mechanism.joints.iter().map(|m| Block::Dynamics(m.joint.child)).collect()
     }
 
     /// Moving joints (all their numbers count), and resting ones that they carry (inertia counts).
@@ -677,6 +754,13 @@ impl DynamicsLearner {
                 places.extend(own.iter().map(|i| total + i - offset));
                 total += model.size();
             }
+        }
+        let sensor = self.mechanism.offset(self.mechanism.joints.len());
+        let own: Vec<usize> = window.active.iter().copied().filter(|i| *i >= sensor).collect();
+        if !own.is_empty() {
+            blocks.push((Block::Sensor, SENSOR_SIZE));
+            places.extend(own.iter().map(|i| total + i - sensor));
+            total += SENSOR_SIZE;
         }
         // Kinematic numbers that do not matter stay out of the site.
         let mut columns: Vec<usize> = Vec::new();
@@ -750,7 +834,7 @@ pub(super) fn given_kinematics(joint: &Joint<Block>, blocks: &[Block]) -> Result
     if n == 0 { Err(Failure::NoInformation) } else { Ok(gaussian) }
 }
 
-fn kinematics_of(fit: &KinematicFit) -> TrackKinematics {
+pub(super) fn kinematics_of(fit: &KinematicFit) -> TrackKinematics {
     TrackKinematics { axes: fit.joints.iter().map(|j| j.axis).collect(), tool_offset: fit.tool_offset }
 }
 
@@ -785,7 +869,39 @@ fn with_stops(prior: &Gaussian, memory: &JointMemory) -> Gaussian {
     gaussian
 }
 
-fn range(values: &[f64]) -> (f64, f64) {
+/// A joint's prior with those of effects that came to it, or went.
+pub(super) fn extended(prior: &Gaussian, model: &JointModel) -> Result<Gaussian, Failure> {
+    let own = model.prior([0.0; 2])?;
+    let mut gaussian = own.clone();
+    for i in 0..SIZE {
+        gaussian.information[i] = prior.information[i];
+        for j in 0..SIZE {
+            gaussian.precision[(i, j)] = prior.precision[(i, j)];
+        }
+    }
+    Ok(gaussian)
+}
+
+/// The sensor's numbers, in units of their scales, when nothing was read at rest.
+pub(super) fn standard_sensor() -> Result<Gaussian, Failure> {
+    Gaussian::from_moments(&DVector::zeros(SENSOR_SIZE), &DMatrix::identity(SENSOR_SIZE, SENSOR_SIZE))
+}
+
+/// The way from the reference position to the farther end, with its sign.
+pub(super) fn travel_of(positions: &[f64]) -> f64 {
+    let (low, high) = range(positions);
+    let travel = if -low > high { low } else { high };
+    if travel.abs() > 1e-3 { travel } else { 1e-3 }
+}
+
+/// An effect as it would be on a joint of these scales.
+pub(super) fn added_effect(kind: EffectKind, scales: &JointScales) -> AddedEffect {
+    let JointScales { force, rate, travel } = *scales;
+    let scales = Scales { force, rate, position: travel.abs(), duration_s: TYPICAL_RECORD_S };
+    AddedEffect { kind, scales, reference: 0.0, reversed: travel < 0.0 }
+}
+
+pub(super) fn range(values: &[f64]) -> (f64, f64) {
     values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), &x| (l.min(x), h.max(x)))
 }
 

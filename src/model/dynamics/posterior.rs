@@ -3,7 +3,7 @@
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 
 use super::layout::{CENTER, DAMPING, FRICTION, INERTIA, LOWER, MASS, UPPER};
-use super::learner::{Block, DynamicsLearner};
+use super::learner::DynamicsLearner;
 use crate::inference::Failure;
 use crate::mechanism::{JointType, Tree};
 use crate::types::Label;
@@ -64,7 +64,7 @@ impl DynamicsLearner {
         if models.is_empty() {
             return Err(Failure::NoInformation);
         }
-        let blocks: Vec<Block> = models.iter().map(|m| Block::Dynamics(m.joint.child)).collect();
+        let blocks = self.blocks();
         let (mean, covariance) = self.belief.product(None).moments(&blocks)?;
         let mut posterior = DynamicsPosterior { joints: Vec::new(), parts: Vec::new(), mean, covariance };
         let prior_deviation = |k: usize, entry: usize| {

@@ -44,8 +44,6 @@ pub struct WindowFit<'a> {
 /// A fitted window.
 #[derive(Clone, Debug)]
 pub struct FittedWindow {
-    /// The entries of the full parameter vector that were fitted.
-    pub active: Vec<usize>,
     /// The optimum of them.
     pub solution: Solution,
     /// κ.
@@ -155,7 +153,6 @@ impl WindowFit<'_> {
             }
             let innovations = problem.latest;
             return Ok(FittedWindow {
-                active: self.active.clone(),
                 reduction: reduction(&innovations.whitened, self.source.moving.len()),
                 noise_scale: scale,
                 log_predictive: solution.log_evidence - innovations.half_log_determinant - scale_cost(scale),
@@ -276,12 +273,13 @@ fn retracted(joint: &KinematicJoint, which: usize, step: f64) -> Axis {
     }
 }
 
-fn scale_cost(scale: f64) -> f64 {
+/// −ln prior of κ.
+pub fn scale_cost(scale: f64) -> f64 {
     0.5 * (scale.ln() / LOG_NOISE_DEVIATION).powi(2)
 }
 
 /// Variance of the innovations, at least one, times their integrated autocorrelation, at least one.
-fn reduction(whitened: &[f64], rows: usize) -> f64 {
+pub fn reduction(whitened: &[f64], rows: usize) -> f64 {
     let n = whitened.len() as f64;
     let squares: f64 = whitened.iter().map(|e| e * e).sum();
     let variance = ((squares + VARIANCE_PRIOR) / (n + VARIANCE_PRIOR)).max(1.0);

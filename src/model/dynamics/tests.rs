@@ -9,7 +9,7 @@ use rand_distr::{Distribution, StandardNormal};
 
 use super::innovations::WindowModel;
 use super::layout::{DAMPING, FRICTION, INERTIA};
-use super::layout::{JointScales, Mechanism, SIZE, joint_models};
+use super::layout::{JointScales, Mechanism, SIZE, SensorModel, joint_models};
 use super::learner::{DynamicsInput, DynamicsLearner};
 use super::posterior::DynamicsPosterior;
 use super::track::{TrackKinematics, TrackSource, joint_track};
@@ -412,7 +412,7 @@ fn innovations_have_their_gradient() {
             moving: &moving,
         };
         let track = joint_track(&source, &kinematics).unwrap();
-        let scales = vec![JointScales { force: 1.0, rate: 0.5 }; n];
+        let scales = vec![JointScales { force: 1.0, rate: 0.5, travel: 0.3 }; n];
         let models =
             joint_models(&truth.joints, |j| truth.hulls[&j.child].clone(), &scales, &vec![[false; 2]; n], &GRAVITY);
         let active: Vec<usize> =
@@ -424,7 +424,7 @@ fn innovations_have_their_gradient() {
         for k in 0..n {
             x[k * SIZE + 1] = -1.2;
         }
-        let mechanism = Mechanism { joints: models, gravity: GRAVITY };
+        let mechanism = Mechanism { joints: models, gravity: GRAVITY, sensor: SensorModel::default() };
         let frozen = vec![None; n];
         let model = WindowModel {
             mechanism: &mechanism,

@@ -91,6 +91,8 @@ pub struct JointTrack {
 pub struct Drive {
     /// The joint whose child it acts on.
     pub joint: usize,
+    /// Whether it is a tool's, with zeros about the contact.
+    pub tool: bool,
     /// Readings in order of time.
     pub samples: Vec<WrenchSample>,
     /// Standard deviation of one force reading, per axis \[N\].
@@ -109,6 +111,7 @@ impl Drive {
         let span_s = samples.last().map_or(0.0, |l| l.stamp_s - samples[0].stamp_s);
         Self {
             joint,
+            tool: false,
             force_deviation: local_deviation(&readings(|s| s.force_in_world)),
             torque_deviation: local_deviation(&readings(|s| s.torque_in_world)),
             sample_span_s: span_s / (samples.len().max(2) - 1) as f64,
@@ -216,7 +219,7 @@ pub fn joint_track(source: &TrackSource<'_>, kinematics: &TrackKinematics) -> Op
         let samples = own.iter().filter(in_contact).map(|w| sample(w, kinematics.tool_offset)).collect();
         let drive = Drive::new(touch.joint, samples);
         // What its torque's noise does to the joints is next to nothing beside what its force's does.
-        drives.push(Drive { samples: with_ends(drive.samples), torque_deviation: 0.0, ..drive });
+        drives.push(Drive { tool: true, samples: with_ends(drive.samples), torque_deviation: 0.0, ..drive });
         if source.use_tool {
             let tool: Vec<(f64, Vector3<f64>)> = own
                 .iter()

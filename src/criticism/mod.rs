@@ -1,0 +1,187 @@
+//! Finds what the model lacks: residual, candidates, refit, verdict (DESIGN.md section 7).
+//!
+//! Every window is in the batch that hypotheses are fitted to. The evidence of a hypothesis is the
+//! product of the predictive densities of the windows, each by those before it, so that comparing
+//! evidence compares predictions of what was not learned yet.
+
+mod findings;
+mod numbers;
+mod rest;
+mod score;
+mod selection;
+mod signature;
+mod statistics;
+
+pub use numbers::{Addition, Numbers, Workshop};
+pub use selection::{Component, Selection, Selector};
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde::{Deserialize, Serialize};
+
+use crate::inference::Failure;
+use crate::model::{BatchWindow, DynamicsInput, DynamicsLearner, KinematicFit};
+use crate::types::Label;
+use crate::types::posterior::{Criticism, Verdict};
+use rest::RestReadings;
+use score::scores;
+
+/// Windows of the same joints that are looked at together at most.
+const MOST_WINDOWS: usize = 8;
+/// Standard deviations of the sensor's errors by the prior: force \[N\], torque \[N·m\], delay \[s\].
+const SENSOR_SCALES: [f64; 3] = [1.0, 0.2, 0.05];
+
+/// Follows a learner and says what it lacks.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub struct Critic {
+    /// The last selection.
+    #[serde(skip)]
+    pub selection: Option<Selection>,
+    findings: Option<Criticism>,
+    adopted: bool,
+    /// The joints that the last selection's numbers are about, and the numbers.
+    #[serde(skip)]
+    known: Option<(Vec<Label>, Numbers)>,
+}
+
+impl Critic {
+    /// What was found by the last review.
+    pub fn findings(&self) -> Criticism {
+        self.findings.clone().unwrap_or_else(Criticism::insufficient)
+    }
+
+    /// Looks at all windows so far; effects that they call for are in the learner's model after it.
+    /// Returns the linearizations spent.
+    ///
+    /// # Errors
+    /// Where no hypothesis could be fitted: the findings are then as before.
+    pub fn review(
+        &mut self,
+        learner: &mut DynamicsLearner,
+        fit: &KinematicFit,
+        input: &DynamicsInput<'_>,
+    ) -> Result<usize, Failure> {
+        let batch = learner.batch(fit, input, MOST_WINDOWS);
+        if batch.is_empty() {
+            return Ok(0);
+        }
+        let rest = RestReadings::of(&batch, input, &SENSOR_SCALES);
+        let spans = input.windows.iter().filter_map(|w| Some([*w.times_s.first()?, *w.times_s.last()?])).collect();
+        let rest_prior = rest.as_ref().and_then(RestReadings::posterior);
+        let labels: Vec<Label> = fit.joints.iter().map(|joint| joint.child).collect();
+        let (joints, sensor) = learner.numbers()?;
+        let known = self.known.as_ref().filter(|(of, _)| *of == labels);
+        let known_joints = known.is_some();
+        let added = known.map_or_else(BTreeMap::new, |(_, numbers)| numbers.added.clone());
+        let numbers = Numbers { joints, sensor, added };
+        let (selected, findings, scales) = {
+            let workshop =
+                Workshop { learner, fit, input, rest_prior: rest_prior.clone(), sensor_scales: SENSOR_SCALES, spans };
+            let found =
+                self.selection.as_ref().filter(|_| known_joints).map(|s| s.additions.clone()).unwrap_or_default();
+            let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref(), found: &found };
+            let base = selector.base(&numbers)?;
+            tracing::debug!(evidence = base.log_evidence, additions = ?base.additions, kappa = ?noise_scales(&base, &batch), "base");
+            let before = scores(&workshop, &batch, &base).unwrap_or_default();
+            let selected = selector.select(base.clone())?;
+            // A window that no hypothesis comes near, while the others are explained, is none of the physics'.
+            let outlying = outlying(&selected);
+            let rest_of_batch: Vec<BatchWindow> = batch
+                .iter()
+                .enumerate()
+                .filter(|(w, _)| !outlying.contains(w))
+                .map(|(_, window)| window.clone())
+                .collect();
+            let batch = &rest_of_batch[..];
+            let selector = Selector { batch, ..selector };
+            let (base, before, selected) = if outlying.is_empty() {
+                (base, before, selected)
+            } else {
+                tracing::debug!(?outlying, "windows left out");
+                let base_additions = base.additions.clone();
+                let base = selector.fitted(&base_additions, &base.numbers, (6, 1))?;
+                let before = scores(&workshop, batch, &base).unwrap_or_default();
+                (base.clone(), before, selector.select(base)?)
+            };
+            let mut selected = selector.describe_leftover(selected)?;
+            let mut after = before.clone();
+            if !selected.rivals.is_empty() {
+                match scores(&workshop, batch, &selected) {
+                    // What does not predict windows not yet learned better is not there.
+                    Ok(found) if found.windows == 0 || found.log_predictive_density > before.log_predictive_density => {
+                        after = found;
+                    }
+                    _ => selected = Selection { steps: selected.steps, ..base },
+                }
+            }
+            tracing::debug!(evidence = selected.log_evidence, steps = selected.steps, additions = ?selected.additions,
+                kappa = ?noise_scales(&selected, batch), before = before.log_predictive_density, after = after.log_predictive_density, "selected");
+            // What weighs most decides: a name beside a stronger unknown explains little.
+            let loss = |addition: &Addition| {
+                let rivals = selected.rivals.get(addition)?;
+                rivals.iter().find(|(rival, _)| rival.is_none()).map(|(_, difference)| -difference)
+            };
+            let found = selected.additions.iter().filter_map(|a| Some((loss(a)?, a)));
+            let named = found.max_by(|a, b| a.0.total_cmp(&b.0)).is_some_and(|(_, a)| a.name() != "unknown");
+            let verdict = match () {
+                () if before.windows < 2 => Verdict::Insufficient,
+                () if named => Verdict::EffectFound,
+                () if !selected.rivals.is_empty() => Verdict::Unexplained,
+                () => Verdict::Adequate,
+            };
+            let findings = Criticism { verdict, effects: Vec::new(), before: before.rows, after: after.rows };
+            let scales = noise_scales(&selected, batch);
+            (selected, findings, scales)
+        };
+        let found = findings.verdict != Verdict::Insufficient && !selected.rivals.is_empty();
+        let mut findings = findings;
+        if found || self.adopted {
+            let additions = if found { selected.additions.clone() } else { BTreeSet::new() };
+            let spans = input.windows.iter().filter_map(|w| Some([*w.times_s.first()?, *w.times_s.last()?])).collect();
+            let hypothesis =
+                Workshop { learner, fit, input, rest_prior: rest_prior.clone(), sensor_scales: SENSOR_SCALES, spans }
+                    .hypothesis(&additions)?;
+            let x = selected.numbers.laid_out(&hypothesis, &additions);
+            let prior = rest_prior.as_ref().filter(|_| additions.contains(&Addition::Bias));
+            learner.adopt(&hypothesis, &x, &scales, prior, (fit, input))?;
+            self.adopted = found;
+            if found {
+                findings.effects = findings::effects(learner, &hypothesis, &selected, fit);
+            }
+        }
+        let steps = selected.steps;
+        self.known = Some((labels, selected.numbers.clone()));
+        self.findings = Some(findings);
+        self.selection = Some(selected);
+        Ok(steps)
+    }
+}
+
+/// κ by window.
+fn noise_scales(selection: &Selection, batch: &[BatchWindow]) -> Vec<(usize, f64)> {
+    let mut scales: Vec<(usize, f64)> = Vec::new();
+    for component in &selection.components {
+        if let Some(fitted) = &component.fitted {
+            let own = component.windows.iter().zip(&fitted.windows);
+            scales.extend(own.map(|(&w, window)| (batch[w].index, window.noise_scale)));
+        }
+    }
+    scales.sort_by_key(|(index, _)| *index);
+    scales
+}
+
+/// κ of a window that a model does not come near.
+const OUTLYING: f64 = 1e4;
+
+/// Places in the batch of the windows that the selected model does not come near, where most are explained.
+fn outlying(selection: &Selection) -> Vec<usize> {
+    let mut far = Vec::new();
+    let mut all = 0;
+    for component in &selection.components {
+        let Some(fitted) = &component.fitted else { continue };
+        all += component.windows.len();
+        let own = component.windows.iter().zip(&fitted.windows);
+        far.extend(own.filter(|(_, window)| window.noise_scale >= OUTLYING).map(|(w, _)| *w));
+    }
+    if 3 * far.len() <= all { far } else { Vec::new() }
+}

@@ -1,0 +1,571 @@
+//! Which additions the windows call for: forward selection by evidence, each refitted.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::numbers::{Addition, Numbers, Workshop};
+use super::rest::RestReadings;
+use super::signature::{Probes, Ranked, probes, start_by_direction};
+use crate::inference::Failure;
+use crate::mechanism::effects::{EffectKind, TableKind};
+use crate::model::{BatchFit, BatchWindow, Hypothesis};
+
+/// An addition is accepted if it raises the log evidence by this, and by the logarithm of how many
+/// were tried: see docs/criticism.md for the false alarms that it leaves.
+const LEAST_GAIN: f64 = 6.0;
+/// The same for a table, which fits much.
+const LEAST_TABLE_GAIN: f64 = 10.0;
+/// How many of the ranked are refitted, and from how much first-order gain on \[nats\].
+const REFITTED: usize = 5;
+const WORTH_A_REFIT: f64 = 3.0;
+/// Additions at most.
+const MOST: usize = 4;
+/// A stop is believed from this gain on.
+const STOP_GAIN: f64 = 4.0;
+/// A pulse may be anywhere: it counts as this many candidates.
+const PLACES: f64 = 150.0;
+/// κ from which on a window is not explained, and how many tables are then tried in any case.
+const MISFIT: f64 = 10.0;
+const TABLES_TRIED: usize = 4;
+/// Rank of what was found before.
+const KNOWN: f64 = 1e9;
+/// A delay is tried from these \[scales\]: the motion's dependence on it is far from linear.
+const DELAYS: [f64; 4] = [-0.8, 0.3, 1.0, 2.0];
+/// A review ends at this many linearizations of a window; one in which several joints move counts for
+/// the square of their number and as much again.
+const BUDGET: usize = 1500;
+/// Linearizations of a refit, and how often κ is chosen anew.
+const REFIT: (usize, usize) = (8, 2);
+
+/// The model selected, with all that was compared on the way.
+#[derive(Clone, Debug)]
+pub struct Selection {
+    /// What it has beyond the declared physics.
+    pub additions: BTreeSet<Addition>,
+    /// Its numbers.
+    pub numbers: Numbers,
+    /// By component of joints that move together: its joints, its windows, and the fit.
+    pub components: Vec<Component>,
+    /// Log evidence \[nats\].
+    pub log_evidence: f64,
+    /// For every addition accepted: the log evidence of the model without it, and of those with
+    /// another in its place.
+    pub rivals: BTreeMap<Addition, Vec<(Option<Addition>, f64)>>,
+    /// What tables would gain over the model at first order \[nats\], most first.
+    pub leftover: Vec<(Addition, f64)>,
+    /// Linearizations of all windows spent.
+    pub steps: usize,
+}
+
+/// Joints whose windows hang together.
+#[derive(Clone, Debug)]
+pub struct Component {
+    /// Joints by index.
+    pub joints: Vec<usize>,
+    /// Places of its windows in the batch.
+    pub windows: Vec<usize>,
+    /// The fit of those.
+    pub fitted: Option<BatchFit>,
+}
+
+/// Joints that move in the same windows, or all that move if `together`.
+pub fn components(batch: &[BatchWindow], together: bool) -> Vec<Component> {
+    let mut components: Vec<Component> = Vec::new();
+    for (w, window) in batch.iter().enumerate() {
+        let joints: Vec<usize> = window.involved.iter().map(|(joint, _)| *joint).collect();
+        let mut merged = Component { joints, windows: vec![w], fitted: None };
+        components.retain(|component| {
+            let shares = together || component.joints.iter().any(|joint| merged.joints.contains(joint));
+            if shares {
+                merged.joints.extend(&component.joints);
+                merged.windows.extend(&component.windows);
+            }
+            !shares
+        });
+        merged.joints.sort_unstable();
+        merged.joints.dedup();
+        merged.windows.sort_unstable();
+        components.push(merged);
+    }
+    components.sort_by_key(|component| component.joints.clone());
+    components
+}
+
+/// What candidates are tried on.
+pub struct Selector<'a> {
+    /// What models are made from.
+    pub workshop: &'a Workshop<'a>,
+    /// The windows.
+    pub batch: &'a [BatchWindow],
+    /// What the sensor read at rest.
+    pub rest: Option<&'a RestReadings>,
+    /// What the last review found: joints that the newest window does not concern are only asked for it.
+    pub found: &'a BTreeSet<Addition>,
+}
+
+/// A refitted candidate.
+struct Trial {
+    addition: Addition,
+    /// All of its model.
+    additions: BTreeSet<Addition>,
+    gain: f64,
+    hypothesis: Hypothesis,
+    fits: Vec<(Vec<usize>, BatchFit)>,
+}
+
+impl Selector<'_> {
+    /// What a linearization of these windows costs, in those of windows of one joint.
+    fn weight(&self, windows: &[usize]) -> usize {
+        let one = |w: &usize| match self.batch[*w].moving.len() {
+            1 => 1,
+            several => 2 * several * several,
+        };
+        windows.iter().map(one).sum()
+    }
+
+    fn cost(&self, trial: &Trial) -> usize {
+        trial.fits.iter().map(|(windows, fitted)| fitted.steps * self.weight(windows)).sum()
+    }
+
+    fn windows(&self, places: &[usize]) -> Vec<&BatchWindow> {
+        places.iter().map(|&w| &self.batch[w]).collect()
+    }
+
+    /// The model with these additions and no others.
+    pub fn fitted(
+        &self,
+        additions: &BTreeSet<Addition>,
+        numbers: &Numbers,
+        effort: (usize, usize),
+    ) -> Result<Selection, Failure> {
+        let together = additions.iter().any(|a| a.joint().is_none());
+        let hypothesis = self.workshop.hypothesis(additions)?;
+        let mut selection = Selection {
+            additions: additions.clone(),
+            numbers: numbers.clone(),
+            components: components(self.batch, together),
+            log_evidence: self.sensor_evidence(additions),
+            rivals: BTreeMap::new(),
+            leftover: Vec::new(),
+            steps: 0,
+        };
+        for component in &mut selection.components {
+            let windows = self.windows(&component.windows);
+            let x = selection.numbers.laid_out(&hypothesis, additions);
+            let scales = vec![10.0; windows.len()];
+            let fitted = hypothesis.fit(&windows, &x, &scales, effort)?;
+            selection.numbers.take(&hypothesis, additions, &fitted.x, &component.joints);
+            selection.log_evidence += fitted.log_evidence;
+            selection.steps += fitted.steps * self.weight(&component.windows);
+            component.fitted = Some(fitted);
+        }
+        Ok(selection)
+    }
+
+    /// What the readings at rest say of the additions.
+    fn sensor_evidence(&self, additions: &BTreeSet<Addition>) -> f64 {
+        let biased = additions.contains(&Addition::Bias);
+        self.rest.filter(|_| biased).map_or(0.0, RestReadings::evidence_of_bias)
+    }
+
+    /// The declared physics with the end stops that the windows show.
+    pub fn base(&self, numbers: &Numbers) -> Result<Selection, Failure> {
+        let declared = self.workshop.learner.declared_mechanism();
+        let mut best: Option<Selection> = None;
+        let mut bland = numbers.clone();
+        bland.joints.clear();
+        // The learner's numbers may be what a wrong model made of the windows.
+        for start in [numbers, &bland] {
+            let misfit = best.as_ref().is_none_or(|b| {
+                let fits = b.components.iter().filter_map(|c| c.fitted.as_ref());
+                fits.flat_map(|f| &f.windows).any(|w| w.reduction > 3.0 || w.noise_scale > 50.0)
+            });
+            if !misfit {
+                continue;
+            }
+            if let Ok(fitted) = self.fitted(&BTreeSet::new(), start, (10, 2))
+                && best.as_ref().is_none_or(|b| fitted.log_evidence > b.log_evidence)
+            {
+                best = Some(fitted);
+            }
+        }
+        let mut current = best.ok_or(Failure::Diverged)?;
+        for component in current.components.clone() {
+            for &joint in &component.joints {
+                let moved = component.windows.iter().any(|&w| self.batch[w].moving.contains(&joint));
+                for upper in [false, true].into_iter().filter(|_| moved) {
+                    let stop = Addition::Stop(joint, upper);
+                    if declared.joints[joint].stops[usize::from(upper)] {
+                        continue;
+                    }
+                    let (low, high) = self.workshop.range(joint);
+                    let start = vec![if upper { high } else { low }];
+                    if let Ok(trial) = self.trial(&current, &Ranked { addition: stop, gain: 0.0, start }, (5, 1)) {
+                        current.steps += self.cost(&trial);
+                        if trial.gain > STOP_GAIN {
+                            self.take(&mut current, &trial);
+                        }
+                    }
+                }
+            }
+        }
+        Ok(current)
+    }
+
+    /// Adds what the windows call for, until nothing gains enough.
+    pub fn select(&self, mut current: Selection) -> Result<Selection, Failure> {
+        let declared = self.workshop.learner.declared_mechanism();
+        let friction_declared = declared.joints.iter().all(|joint| joint.friction);
+        while current.rivals.len() < MOST * declared.joints.len().max(1) {
+            let (ranked, leftover) = self.ranked(&current, friction_declared)?;
+            current.leftover = leftover;
+            let candidates = ranked.len().max(1) as f64;
+            let mut trials: Vec<Trial> = Vec::new();
+            for candidate in self.shortlist(&ranked) {
+                if current.steps > BUDGET {
+                    break;
+                }
+                if let Ok(trial) = self.best_trial(&current, &candidate) {
+                    current.steps += self.cost(&trial);
+                    tracing::debug!(addition = ?trial.addition, first_order = candidate.gain, gain = trial.gain, "trial");
+                    trials.push(trial);
+                }
+            }
+            trials.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.addition.cmp(&b.addition)));
+            let least = LEAST_GAIN + candidates.ln();
+            let needs = |trial: &Trial| match trial.addition {
+                Addition::Effect(_, EffectKind::Impulse) => least + PLACES.ln(),
+                _ => least,
+            };
+            let Some(best) = trials.iter().find(|trial| trial.gain > needs(trial)).or(trials.first()) else { break };
+            if best.gain < needs(best) {
+                // A right effect can gain nothing until its partner is in.
+                match self.pair(&current, best, friction_declared, least)? {
+                    Some(pair) => current = pair,
+                    None => break,
+                }
+                continue;
+            }
+            let mut rivals: Vec<(Option<Addition>, f64)> = trials
+                .iter()
+                .filter(|t| t.addition != best.addition && same_place(t.addition, best.addition))
+                .map(|t| (Some(t.addition), t.gain - best.gain))
+                .collect();
+            rivals.push((None, -best.gain));
+            let addition = best.addition;
+            self.take(&mut current, best);
+            current.rivals.insert(addition, rivals);
+            self.drop_what_is_not_needed(&mut current, addition)?;
+        }
+        Ok(current)
+    }
+
+    /// The model with the best candidate and the best partner of it, if the two gain enough.
+    fn pair(
+        &self,
+        current: &Selection,
+        first: &Trial,
+        friction_declared: bool,
+        least: f64,
+    ) -> Result<Option<Selection>, Failure> {
+        if first.gain < 0.0 {
+            return Ok(None);
+        }
+        let mut with_first = current.clone();
+        self.take(&mut with_first, first);
+        let (ranked, _) = self.ranked(&with_first, friction_declared)?;
+        let candidates = ranked.len().max(1) as f64;
+        for candidate in self.shortlist(&ranked).into_iter().take(2) {
+            let Ok(second) = self.best_trial(&with_first, &candidate) else { continue };
+            if first.gain + second.gain > least + candidates.ln() {
+                self.take(&mut with_first, &second);
+                with_first.rivals.insert(first.addition, vec![(None, -first.gain - second.gain)]);
+                with_first.rivals.insert(second.addition, vec![(None, -second.gain)]);
+                return Ok(Some(with_first));
+            }
+        }
+        Ok(None)
+    }
+
+    /// The best of a candidate's starts, refitted.
+    fn best_trial(&self, current: &Selection, candidate: &Ranked) -> Result<Trial, Failure> {
+        if candidate.addition != Addition::Delay {
+            return self.trial(current, candidate, REFIT);
+        }
+        let mut bland = current.clone();
+        bland.numbers.joints.clear();
+        let mut best: Option<(f64, Ranked, &Selection)> = None;
+        for from in [current, &bland] {
+            for delay in DELAYS {
+                let start = Ranked { start: vec![delay], ..candidate.clone() };
+                if let Ok(trial) = self.trial(from, &start, (4, 0))
+                    && best.as_ref().is_none_or(|(gain, _, _)| trial.gain > *gain)
+                {
+                    best = Some((trial.gain, start, from));
+                }
+            }
+        }
+        let (_, start, from) = best.ok_or(Failure::Diverged)?;
+        self.trial(from, &start, REFIT)
+    }
+
+    /// Everything that might be added, by joint, and what tables would gain.
+    fn ranked(
+        &self,
+        current: &Selection,
+        friction_declared: bool,
+    ) -> Result<(Vec<Ranked>, Vec<(Addition, f64)>), Failure> {
+        let hypothesis = self.workshop.hypothesis(&current.additions)?;
+        let mut ranked: Vec<Ranked> = Vec::new();
+        let mut leftover: Vec<(Addition, f64)> = Vec::new();
+        let newest = self.batch.iter().map(|w| w.index).max();
+        let mut of_sensor: BTreeMap<Addition, Ranked> = BTreeMap::new();
+        for component in &current.components {
+            let Some(fitted) = &component.fitted else { continue };
+            let windows = self.windows(&component.windows);
+            let moved: Vec<usize> = component
+                .joints
+                .iter()
+                .copied()
+                .filter(|joint| windows.iter().any(|w| w.moving.contains(joint)))
+                .collect();
+            let concerned = windows.iter().any(|w| Some(w.index) == newest);
+            let known = self.found.iter().filter(|a| a.joint().is_none_or(|joint| moved.contains(&joint)));
+            let known = known.filter(|a| !current.additions.contains(a) && !matches!(a, Addition::Stop(..)));
+            for addition in known.copied() {
+                let start = current.numbers.added.get(&addition).cloned().unwrap_or_default();
+                ranked.push(Ranked { addition, gain: KNOWN, start });
+            }
+            for (k, &joint) in moved.iter().filter(|_| concerned).enumerate() {
+                let [own, sensor] = probes(self.workshop, &hypothesis, fitted, &windows, joint)?;
+                leftover.extend(self.leftover(&own, joint));
+                ranked.extend(own.rank(&current.additions, friction_declared));
+                if k > 0 {
+                    continue;
+                }
+                for candidate in sensor.rank(&current.additions, friction_declared) {
+                    let entry = of_sensor
+                        .entry(candidate.addition)
+                        .or_insert_with(|| Ranked { gain: 0.0, ..candidate.clone() });
+                    entry.gain += candidate.gain;
+                }
+            }
+        }
+        ranked.extend(of_sensor.into_values());
+        // What was found before is tried from where it was, and anew.
+        leftover.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+        Ok((ranked, leftover))
+    }
+
+    /// The best few of every joint, and the sensor's.
+    fn shortlist(&self, ranked: &[Ranked]) -> Vec<Ranked> {
+        let mut by_place: BTreeMap<Option<usize>, Vec<&Ranked>> = BTreeMap::new();
+        for candidate in ranked {
+            by_place.entry(candidate.addition.joint()).or_default().push(candidate);
+        }
+        let mut shortlist: Vec<Ranked> = Vec::new();
+        for mut candidates in by_place.into_values() {
+            candidates.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.addition.cmp(&b.addition)));
+            let rest = |c: &Ranked| {
+                c.addition == Addition::Bias && self.sensor_evidence(&BTreeSet::from([Addition::Bias])) > 0.0
+            };
+            let worth = candidates.iter().filter(|c| c.gain > WORTH_A_REFIT || rest(c)).take(REFITTED);
+            shortlist.extend(worth.map(|c| (*c).clone()));
+        }
+        shortlist
+    }
+
+    /// The model with one addition more, refitted where it matters.
+    fn trial(&self, current: &Selection, candidate: &Ranked, effort: (usize, usize)) -> Result<Trial, Failure> {
+        let addition = candidate.addition;
+        let mut additions = current.additions.clone();
+        additions.insert(addition);
+        // What pulls towards the closed position leans on its stop, which shows only now.
+        let stop = self.closed_stop(addition).filter(|stop| additions.insert(*stop));
+        let hypothesis = self.workshop.hypothesis(&additions)?;
+        let mut numbers = current.numbers.clone();
+        let mut start = candidate.start.clone();
+        if let Addition::Effect(joint, kind @ EffectKind::AsymmetricFriction) = addition
+            && let Some(effect) = hypothesis.mechanism.joints[joint].effects.last()
+            && !numbers.joints.is_empty()
+        {
+            start = start_by_direction(&numbers.joints[joint], &start, kind, &effect.scales);
+        }
+        numbers.added.insert(addition, start);
+        if let Some(Addition::Stop(joint, upper)) = stop {
+            let (low, high) = self.workshop.range(joint);
+            numbers.added.insert(Addition::Stop(joint, upper), vec![if upper { high } else { low }]);
+        }
+        let x = numbers.laid_out(&hypothesis, &additions);
+        let concerned: Vec<&Component> = match addition.joint() {
+            Some(joint) => current.components.iter().filter(|c| c.joints.contains(&joint)).collect(),
+            None => current.components.iter().collect(),
+        };
+        let mut places: Vec<usize> = concerned.iter().flat_map(|c| c.windows.iter().copied()).collect();
+        places.sort_unstable();
+        let before: f64 = concerned.iter().filter_map(|c| c.fitted.as_ref()).map(|f| f.log_evidence).sum();
+        let scale = |w: &usize| {
+            concerned.iter().find_map(|c| {
+                let at = c.windows.iter().position(|own| own == w)?;
+                c.fitted.as_ref().map(|f| f.windows[at].noise_scale)
+            })
+        };
+        let scales: Vec<f64> = places.iter().map(|w| scale(w).unwrap_or(10.0)).collect();
+        let fitted = hypothesis.fit(&self.windows(&places), &x, &scales, effort)?;
+        let rest = self.sensor_evidence(&additions) - self.sensor_evidence(&current.additions);
+        let gain = fitted.log_evidence - before + rest;
+        Ok(Trial { addition, additions, gain, hypothesis, fits: vec![(places, fitted)] })
+    }
+
+    /// The stop at the closed end, if the effect pulls there and the joint was there.
+    fn closed_stop(&self, addition: Addition) -> Option<Addition> {
+        let joint = match addition {
+            Addition::Effect(
+                joint,
+                EffectKind::Catch
+                | EffectKind::SoftClose
+                | EffectKind::Spring
+                | EffectKind::SelfClosing
+                | EffectKind::GravityOffset
+                | EffectKind::AsymmetricFriction,
+            ) => joint,
+            _ => return None,
+        };
+        let scales = self.workshop.learner.joint_scales(joint, self.workshop.fit)?;
+        let (low, high) = self.workshop.range(joint);
+        let upper = scales.travel < 0.0;
+        let end = if upper { high } else { low };
+        let declared = self.workshop.learner.declared_mechanism();
+        let new = !declared.joints[joint].stops[usize::from(upper)] && end.abs() < 0.05 * scales.travel.abs();
+        new.then_some(Addition::Stop(joint, upper))
+    }
+
+    fn take(&self, current: &mut Selection, trial: &Trial) {
+        current.additions.clone_from(&trial.additions);
+        for (places, fitted) in &trial.fits {
+            let together = current.additions.iter().any(|a| a.joint().is_none());
+            if together {
+                current.components = components(self.batch, true);
+            }
+            for component in &mut current.components {
+                if component.windows == *places {
+                    current.numbers.take(&trial.hypothesis, &current.additions, &fitted.x, &component.joints);
+                    component.fitted = Some(fitted.clone());
+                }
+            }
+        }
+        current.log_evidence += trial.gain;
+        // Layouts have changed for the others: their fits are carried over by name.
+        if let Ok(hypothesis) = self.workshop.hypothesis(&current.additions) {
+            let x = current.numbers.laid_out(&hypothesis, &current.additions);
+            for component in &mut current.components {
+                let windows: Vec<&BatchWindow> = component.windows.iter().map(|&w| &self.batch[w]).collect();
+                let Some(fitted) = &mut component.fitted else { continue };
+                fitted.x.clone_from(&x);
+                for (own, window) in fitted.windows.iter_mut().zip(&windows) {
+                    own.active = hypothesis.active(window);
+                }
+                let mut active: Vec<usize> = fitted.windows.iter().flat_map(|w| w.active.iter().copied()).collect();
+                active.sort_unstable();
+                active.dedup();
+                fitted.active = active;
+            }
+        }
+    }
+
+    /// After a right effect is in, one that stood in for it may go.
+    fn drop_what_is_not_needed(&self, current: &mut Selection, newest: Addition) -> Result<(), Failure> {
+        let is_stop = |a: &Addition| matches!(a, Addition::Stop(..));
+        let others: Vec<Addition> = current.additions.iter().copied().filter(|a| *a != newest && !is_stop(a)).collect();
+        for addition in others
+            .into_iter()
+            .filter(|a| a.joint().is_none() || newest.joint().is_none() || a.joint() == newest.joint())
+        {
+            let mut fewer = current.additions.clone();
+            fewer.remove(&addition);
+            let without = self.fitted(&fewer, &current.numbers, (6, 1))?;
+            current.steps += without.steps;
+            tracing::debug!(?addition, loss = current.log_evidence - without.log_evidence, "without");
+            // A name that a table made nearly needless was a wrong one.
+            let of_newest = current.rivals.get(&newest).and_then(|r| r.iter().find(|(rival, _)| rival.is_none()));
+            let least = match (newest, of_newest) {
+                (Addition::Table(..), Some((_, loss))) => LEAST_GAIN.max(-0.5 * loss),
+                _ => LEAST_GAIN,
+            };
+            if without.log_evidence > current.log_evidence - least {
+                let (mut rivals, steps) = (std::mem::take(&mut current.rivals), current.steps);
+                rivals.remove(&addition);
+                *current = Selection { rivals, steps, ..without };
+            }
+        }
+        Ok(())
+    }
+
+    /// What each table would gain over the model on a joint.
+    fn leftover(&self, own: &Probes, joint: usize) -> Vec<(Addition, f64)> {
+        const KINDS: [(TableKind, f64, f64); 6] = [
+            (TableKind::ForceOverPosition, 0.3, 0.3),
+            (TableKind::ForceOverRate, 0.3, 1.0),
+            (TableKind::FrictionOverPosition, 0.3, 0.3),
+            (TableKind::FrictionOverTime, 0.3, 10.0),
+            (TableKind::InertiaOverPosition, 0.2, 0.3),
+            (TableKind::ForceOverTime, 0.3, 0.5),
+        ];
+        let Some(scales) = self.workshop.learner.joint_scales(joint, self.workshop.fit) else { return Vec::new() };
+        let gains = KINDS.iter().filter_map(|&(kind, deviation, correlation)| {
+            let length = match kind {
+                TableKind::ForceOverRate => correlation * scales.rate,
+                TableKind::FrictionOverTime | TableKind::ForceOverTime => correlation,
+                _ => correlation * scales.travel.abs(),
+            };
+            Some((Addition::Table(joint, kind), own.table_gain(kind, deviation, length)?))
+        });
+        gains.collect()
+    }
+
+    /// Adds the tables that what is left calls for; the named ones that then gain nothing go.
+    pub fn describe_leftover(&self, mut current: Selection) -> Result<Selection, Failure> {
+        let leftover = current.leftover.clone();
+        tracing::debug!(?leftover, "leftover");
+        let mut best: BTreeMap<usize, (f64, Trial)> = BTreeMap::new();
+        let mut tried: BTreeMap<usize, usize> = BTreeMap::new();
+        for (addition, gain) in leftover {
+            let Some(joint) = addition.joint() else { continue };
+            // Where κ is large nothing gains much at first order.
+            let count = tried.entry(joint).or_default();
+            if current.steps > BUDGET
+                || *count >= TABLES_TRIED
+                || (gain < LEAST_TABLE_GAIN && !misfits(&current, joint))
+            {
+                continue;
+            }
+            *count += 1;
+            let trial = self.trial(&current, &Ranked { addition, gain, start: Vec::new() }, REFIT);
+            let Ok(trial) = trial else { continue };
+            current.steps += self.cost(&trial);
+            tracing::debug!(?addition, gain, refitted = trial.gain, "table");
+            if trial.gain > LEAST_TABLE_GAIN && best.get(&joint).is_none_or(|(other, _)| trial.gain > *other) {
+                best.insert(joint, (trial.gain, trial));
+            }
+        }
+        for (gain, trial) in best.into_values() {
+            // The layout may have changed since.
+            let addition = trial.addition;
+            let trial = self.trial(&current, &Ranked { addition, gain, start: Vec::new() }, REFIT)?;
+            self.take(&mut current, &trial);
+            current.rivals.insert(addition, vec![(None, -trial.gain)]);
+            self.drop_what_is_not_needed(&mut current, addition)?;
+        }
+        Ok(current)
+    }
+}
+
+/// Whether a window that moves a joint needs far more process noise than the sensor explains.
+fn misfits(current: &Selection, joint: usize) -> bool {
+    let concerned = current.components.iter().filter(|c| c.joints.contains(&joint));
+    concerned.filter_map(|c| c.fitted.as_ref()).flat_map(|f| &f.windows).any(|w| w.noise_scale >= MISFIT)
+}
+
+/// Whether two additions compete to explain the same.
+fn same_place(a: Addition, b: Addition) -> bool {
+    a.joint() == b.joint() || a.joint().is_none() || b.joint().is_none()
+}

@@ -1,0 +1,214 @@
+//! The learner's windows and physics as hypotheses see them, and how one of them is taken over.
+
+use nalgebra::DMatrix;
+
+use super::batch::{BatchWindow, Hypothesis};
+use super::layout::{AddedEffect, JointModel, JointScales, LOWER, Mechanism, SENSOR_SIZE, SIZE, UPPER};
+use super::learner::{
+    Block, DynamicsInput, DynamicsLearner, Site, Warm, added_effect, extended, kinematics_of, standard_sensor,
+    travel_of,
+};
+use super::track::{JointTrack, joint_track};
+use crate::inference::{Failure, Gaussian};
+use crate::mechanism::effects::EffectKind;
+use crate::model::KinematicFit;
+use crate::types::Label;
+
+impl DynamicsLearner {
+    /// The windows in which joints move, in joint space; of those that move the same joints, the
+    /// last `most`.
+    pub fn batch(&self, fit: &KinematicFit, input: &DynamicsInput<'_>, most: usize) -> Vec<BatchWindow> {
+        let kinematics = kinematics_of(fit);
+        let mut batch: Vec<BatchWindow> = Vec::new();
+        for index in (0..input.windows.len().min(self.windows.len())).rev() {
+            let (moving, frozen) = self.moving(index, fit, input);
+            if moving.is_empty() || batch.iter().filter(|w| w.moving == moving).count() >= most {
+                continue;
+            }
+            let Some(mut track) = joint_track(&self.source(index, &moving, fit, input), &kinematics) else { continue };
+            drop_spikes(&mut track);
+            if track.observations.len() < 3 {
+                continue;
+            }
+            let involved = self.involved(fit, &moving);
+            batch.push(BatchWindow { index, axes: kinematics.axes.clone(), frozen, moving, involved, track });
+        }
+        batch.reverse();
+        batch
+    }
+
+    /// The joints with what was declared of them and nothing else.
+    pub fn declared_mechanism(&self) -> Mechanism {
+        let mut mechanism = self.mechanism.clone();
+        mechanism.sensor.bias = false;
+        mechanism.sensor.delay = false;
+        for model in &mut mechanism.joints {
+            model.friction = self.declared.friction;
+            model.effects.truncate(self.declared.effects.len());
+            model.tables.clear();
+        }
+        mechanism
+    }
+
+    /// Typical force and rate of a joint, and the farthest that it went.
+    pub fn joint_scales(&self, joint: usize, fit: &KinematicFit) -> Option<JointScales> {
+        let scales = self.joints.get(&fit.joints.get(joint)?.child)?.scales?;
+        let (low, high) = self.range_of(joint, fit);
+        Some(JointScales { travel: travel_of(&[low, high]), ..scales })
+    }
+
+    /// The least and the greatest position of a joint, a few frames aside: where a tool has let go
+    /// too late, they are off.
+    pub fn range_of(&self, joint: usize, fit: &KinematicFit) -> (f64, f64) {
+        let mut all: Vec<f64> = fit.positions.iter().flat_map(|window| window[joint].iter().copied()).collect();
+        all.sort_by(f64::total_cmp);
+        let aside = (all.len() / 100).min(4);
+        match (all.get(aside), all.len().checked_sub(1 + aside).and_then(|i| all.get(i))) {
+            (Some(low), Some(high)) if low <= high => (*low, *high),
+            _ => (0.0, 0.0),
+        }
+    }
+
+    /// An effect as it would be on a joint.
+    pub fn effect_on(&self, joint: usize, kind: EffectKind, fit: &KinematicFit) -> Option<AddedEffect> {
+        Some(added_effect(kind, &self.joint_scales(joint, fit)?))
+    }
+
+    /// A mechanism with the prior of its numbers; the sensor's by what it read at rest, if known.
+    pub fn hypothesis(&self, mechanism: Mechanism, sensor_prior: Option<&Gaussian>) -> Result<Hypothesis, Failure> {
+        let size = mechanism.size();
+        let mut prior = Gaussian::flat(size);
+        for (k, model) in mechanism.joints.iter().enumerate() {
+            let base = self.belief.prior(&Block::Dynamics(model.joint.child)).ok_or(Failure::NoInformation)?;
+            let offset = mechanism.offset(k);
+            let places: Vec<usize> = (offset..offset + model.size()).collect();
+            prior.multiply_at(&extended(&base.gaussian, model)?, &places);
+        }
+        let sensor = sensor_prior.cloned().map_or_else(standard_sensor, Ok)?;
+        prior.multiply_at(&sensor, &(size - SENSOR_SIZE..size).collect::<Vec<usize>>());
+        Ok(Hypothesis { mechanism, prior })
+    }
+
+    /// The first numbers of each joint as they are believed now, and the sensor's.
+    pub fn numbers(&self) -> Result<(Vec<Vec<f64>>, Vec<f64>), Failure> {
+        let (mean, _) = self.belief.product(None).moments(&self.blocks())?;
+        let joints = (0..self.mechanism.joints.len()).map(|k| {
+            let offset = self.mechanism.offset(k);
+            mean.rows(offset, SIZE).iter().copied().collect()
+        });
+        Ok((joints.collect(), mean.rows(mean.len() - SENSOR_SIZE, SENSOR_SIZE).iter().copied().collect()))
+    }
+
+    /// Takes a fitted hypothesis over: its effects are in the model from now on, and the sites of
+    /// the windows are made about `x`. κ by window.
+    pub fn adopt(
+        &mut self,
+        hypothesis: &Hypothesis,
+        x: &[f64],
+        noise_scales: &[(usize, f64)],
+        sensor_prior: Option<&Gaussian>,
+        (fit, input): (&KinematicFit, &DynamicsInput<'_>),
+    ) -> Result<(), Failure> {
+        // Windows gone by keep what they said, as long as numbers mean the same.
+        let same_sensor = (self.sensor.bias, self.sensor.delay)
+            == (hypothesis.mechanism.sensor.bias, hypothesis.mechanism.sensor.delay);
+        self.sensor = hypothesis.mechanism.sensor;
+        self.sensor_prior = sensor_prior.cloned();
+        let changed = |model: &JointModel| {
+            self.joints.get(&model.joint.child).is_none_or(|memory| {
+                !same_sensor
+                    || memory.friction != model.friction
+                    || memory.effects != model.effects
+                    || memory.tables != model.tables
+            })
+        };
+        let labels: Vec<Label> =
+            hypothesis.mechanism.joints.iter().filter(|m| changed(m)).map(|m| m.joint.child).collect();
+        for (k, model) in hypothesis.mechanism.joints.iter().enumerate() {
+            if let Some(memory) = self.joints.get_mut(&model.joint.child) {
+                memory.friction = model.friction;
+                memory.effects.clone_from(&model.effects);
+                memory.tables.clone_from(&model.tables);
+                memory.stops = model.stops;
+                let offset = hypothesis.mechanism.offset(k);
+                for (side, place) in [LOWER, UPPER].into_iter().enumerate().filter(|(side, _)| model.stops[*side]) {
+                    let place = offset + place;
+                    let prior = &hypothesis.prior;
+                    memory.stop_positions[side] = prior.information[place] / prior.precision[(place, place)];
+                }
+            }
+        }
+        for label in labels {
+            self.forget_sites(label);
+        }
+        self.rebuild(fit)?;
+        for window in 0..self.windows.len() {
+            let (moving, frozen) = self.moving(window, fit, input);
+            if moving.is_empty() {
+                self.windows[window].learned = false;
+                continue;
+            }
+            let known = noise_scales.iter().find(|(index, _)| *index == window).map(|(_, scale)| *scale);
+            // The site of a batch's window is its linearization there; others start from it.
+            let steps = if known.is_some() { 1 } else { 4 };
+            let noise_scale = known.or(self.windows[window].noise_scale).unwrap_or(1.0);
+            let warm = Warm { x: x.to_vec(), noise_scale };
+            match self.fit_window(window, fit, input, &moving, &frozen, (steps, Some(&warm))) {
+                Ok((factor, fitted, _)) => {
+                    self.belief.replace(Site::Window(window), factor);
+                    let memory = &mut self.windows[window];
+                    memory.learned = true;
+                    memory.noise_scale = Some(fitted.noise_scale);
+                    memory.made_with(fit);
+                }
+                Err(_) => self.windows[window].learned = false,
+            }
+        }
+        Ok(())
+    }
+
+    /// Covariance of some numbers of the model as it is believed now, kinematic errors included.
+    pub fn moments_of(&self, places: &[usize]) -> Result<(Vec<f64>, DMatrix<f64>), Failure> {
+        let (mean, covariance) = self.belief.product(None).moments(&self.blocks())?;
+        Ok((
+            places.iter().map(|&i| mean[i]).collect(),
+            DMatrix::from_fn(places.len(), places.len(), |i, j| covariance[(places[i], places[j])]),
+        ))
+    }
+
+    /// The model as it is now.
+    pub fn mechanism(&self) -> &Mechanism {
+        &self.mechanism
+    }
+}
+
+/// Observations farther than this many usual ones, and this far, from the median of those around
+/// them are not of the part \[m or rad\]: a tool that let go before its contact was seen to end.
+const SPIKE: (f64, f64) = (15.0, 0.004);
+
+/// Leaves out observations that stand alone.
+fn drop_spikes(track: &mut JointTrack) {
+    let count = track.positions.len();
+    let joints = track.positions.first().map_or(0, |q| q.len());
+    let mut spikes = vec![false; count];
+    for joint in 0..joints {
+        let path: Vec<f64> = track.positions.iter().map(|q| q[joint]).collect();
+        let distance = |k: usize| {
+            let first = k.saturating_sub(2).min(count.saturating_sub(5));
+            let mut around = path[first..(first + 5).min(count)].to_vec();
+            around.sort_by(f64::total_cmp);
+            (path[k] - around[around.len() / 2]).abs()
+        };
+        let distances: Vec<f64> = (0..count).map(distance).collect();
+        let mut sorted = distances.clone();
+        sorted.sort_by(f64::total_cmp);
+        let usual = sorted.get(count / 2).copied().unwrap_or(0.0);
+        for (spike, distance) in spikes.iter_mut().zip(distances) {
+            *spike |= distance > (SPIKE.0 * usual).max(SPIKE.1);
+        }
+    }
+    let mut keep = spikes.iter().map(|spike| !spike);
+    track.observations.retain(|_| keep.next().unwrap_or(true));
+    let mut keep = spikes.iter().map(|spike| !spike);
+    track.positions.retain(|_| keep.next().unwrap_or(true));
+}

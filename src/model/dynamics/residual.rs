@@ -1,0 +1,92 @@
+//! What a window leaves unexplained, in the units of forces and positions.
+//!
+//! The motion is smoothed (Rauch, Tung, Striebel, AIAA Journal 3, 1965) with process noise so wide
+//! that it hardly depends on the model; what the model's simulation lacks from one smoothed state to
+//! the next, times the inertia, is the residual force.
+
+use nalgebra::{DMatrix, DVector};
+
+use super::innovations::WindowModel;
+use crate::inference::Failure;
+
+/// κ of the smoothing.
+const SMOOTHING: f64 = 300.0;
+/// Positions are simulated this far from smoothed states, which follow each other in half of it \[s\].
+const HORIZON_S: f64 = 1.0;
+
+/// Residuals of one window, by moving joint.
+#[derive(Clone, Debug)]
+pub struct WindowResidual {
+    /// Middle of each span, its length \[s\], and the mean residual force over it \[N or N·m\].
+    pub forces: Vec<(f64, f64, DVector<f64>)>,
+    /// Position and rate at the middle of each span.
+    pub states: Vec<(DVector<f64>, DVector<f64>)>,
+    /// Squares of what positions are off after open simulation, with their count \[m² or rad²\].
+    pub squares: Vec<(f64, usize)>,
+    /// Whitened innovations with the model's own κ.
+    pub whitened: Vec<Vec<f64>>,
+}
+
+impl WindowModel<'_> {
+    /// The residuals at `x`.
+    pub fn residual(&self, x: &[f64]) -> Result<WindowResidual, Failure> {
+        let n = self.moving.len();
+        let own = self.linearize(x, &[])?;
+        let whitened = (0..n).map(|i| own.whitened.iter().skip(i).step_by(n).copied().collect()).collect();
+        let smoothing = WindowModel { noise_scale: SMOOTHING, ..self.clone() };
+        let steps = smoothing.filtered(x)?;
+        let observations = &self.track.observations;
+        let mut smoothed: Vec<DVector<f64>> = steps.iter().map(|s| s.updated.clone()).collect();
+        for k in (0..steps.len() - 1).rev() {
+            let next = &steps[k + 1];
+            let inverse = next.predicted_covariance.clone().cholesky().ok_or(Failure::Singular)?;
+            let gain = &steps[k].updated_covariance * next.transition.transpose() * inverse.inverse();
+            smoothed[k] = &steps[k].updated + gain * (&smoothed[k + 1] - &next.predicted);
+        }
+        let plant = self.plant(x)?;
+        let mut forces = Vec::new();
+        let mut states = Vec::new();
+        for k in 0..steps.len() - 1 {
+            let span = [observations[k].time_s, observations[k + 1].time_s];
+            let length = span[1] - span[0];
+            if length < 1e-4 {
+                continue;
+            }
+            let lacks = &smoothed[k + 1]
+                - &steps[k + 1].predicted
+                - &steps[k + 1].transition * (&smoothed[k] - &steps[k].updated);
+            let middle = (&smoothed[k] + &smoothed[k + 1]) * 0.5;
+            let mass = self.moving_mass(&plant, middle.rows(0, n).as_slice());
+            forces.push((0.5 * (span[0] + span[1]), length, &mass * lacks.rows(n, n) / length));
+            states.push((middle.rows(0, n).into_owned(), middle.rows(n, n).into_owned()));
+        }
+        let mut squares = vec![(0.0, 0); n];
+        let mut first = 0;
+        while first + 1 < steps.len() {
+            let start_s = observations[first].time_s;
+            let mut state = smoothed[first].as_slice()[..2 * n].to_vec();
+            for k in first + 1..steps.len() {
+                if observations[k].time_s > start_s + HORIZON_S {
+                    break;
+                }
+                state = self.advance(&plant, &state, [observations[k - 1].time_s, observations[k].time_s])?;
+                for (i, (sum, count)) in squares.iter_mut().enumerate() {
+                    *sum += (state[i] - smoothed[k][i]).powi(2);
+                    *count += 1;
+                }
+            }
+            let next = observations.iter().position(|o| o.time_s >= start_s + 0.5 * HORIZON_S);
+            first = next.unwrap_or(steps.len()).max(first + 1);
+        }
+        if squares.iter().any(|(sum, _)| !sum.is_finite()) {
+            return Err(Failure::Diverged);
+        }
+        Ok(WindowResidual { forces, states, squares, whitened })
+    }
+
+    fn moving_mass(&self, plant: &super::innovations::Plant<f64>, q: &[f64]) -> DMatrix<f64> {
+        let n = self.moving.len();
+        let mass = plant.tree.mass_matrix(&self.all_positions(q));
+        DMatrix::from_fn(n, n, |i, j| mass[(self.moving[i], self.moving[j])])
+    }
+}
