@@ -132,6 +132,7 @@ fn reproduces(environment: &Path, bag: &str, moving_joints: usize) {
     let eras = eras(bag);
     assert!(eras.len() > 2, "{}", eras.len());
     let (mut travel, mut compared): (f64, usize) = (0.0, 0);
+    let (mut exact, mut all) = (0, 0);
     for era in eras.iter().filter(|era| !era.predicted.is_empty()) {
         let tree = LinkTree::likeliest(&era.posterior);
         // A part that has only gone with its parent may yet move on it; what is predicted meanwhile is not
@@ -146,7 +147,7 @@ fn reproduces(environment: &Path, bag: &str, moving_joints: usize) {
         let positions: Vec<BTreeMap<Label, f64>> =
             displacements.iter().map(|parts| tree.positions(parts, &BTreeMap::new())).collect();
         let loaded = load(environment, era, &tree, &positions, true);
-        for (parts, poses) in displacements.iter().zip(&loaded.poses) {
+        for ((parts, poses), stated) in displacements.iter().zip(&loaded.poses).zip(&predicted) {
             for link in tree.links() {
                 // What has no joint yet is predicted freely, as nothing says how it would move.
                 let known = std::iter::successors(Some(link), |link| link.parent.map(|p| &tree.links()[p]));
@@ -161,8 +162,13 @@ fn reproduces(environment: &Path, bag: &str, moving_joints: usize) {
                 let edges: Vec<_> = (era.posterior.edges.iter())
                     .map(|e| (e.parent.0, e.child.0, e.probability, e.joint_type.likeliest()))
                     .collect();
+                // Where the clouds speak against a joint, the tracking predicts between accounts, and says
+                // so by its spread.
+                let spread = stated[&link.label].covariance_m2.symmetric_eigenvalues().max().sqrt();
+                all += 1;
+                exact += usize::from(error < TOLERANCE);
                 assert!(
-                    error < TOLERANCE,
+                    error < TOLERANCE.max(spread),
                     "{bag}, {} windows, part {}: {error} m, {edges:?}, {tree:?}",
                     era.windows,
                     link.label
@@ -173,6 +179,7 @@ fn reproduces(environment: &Path, bag: &str, moving_joints: usize) {
             }
         }
     }
+    assert!(exact * 10 >= all * 9, "{bag}: {exact} of {all} predictions within {TOLERANCE} m");
     assert!(compared + 2 >= eras.len(), "{bag}: {compared} of {}", eras.len());
     assert!(travel > 0.1, "{bag}: parts moved by {travel} m at most");
 

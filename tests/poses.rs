@@ -142,6 +142,7 @@ fn learned(labels: &[u32], clouds: bool, turns: bool) -> ObjectPosterior {
         assert!(seen.lines().filter(|line| line.split(',').nth(1) == Some(&label.to_string())).count() > 200);
     }
     let document: PosteriorDocument = serde_json::from_str(&fs::read_to_string(posterior).unwrap()).unwrap();
+    eprintln!("{:?}", document.posterior.criticism);
     document.posterior
 }
 

@@ -369,7 +369,13 @@ impl Selector<'_> {
                 c.addition == Addition::Bias && self.sensor_evidence(&BTreeSet::from([Addition::Bias])) > 0.0
             };
             let worth = candidates.iter().filter(|c| c.gain > WORTH_A_REFIT || rest(c)).take(REFITTED);
-            shortlist.extend(worth.map(|c| (*c).clone()));
+            let mut worth: Vec<Ranked> = worth.map(|c| (*c).clone()).collect();
+            // What has more numbers ranks higher, but friction may be all that it finds.
+            let friction = |c: &Ranked| matches!(c.addition, Addition::Friction(_));
+            if !worth.iter().any(friction) {
+                worth.extend(candidates.iter().find(|c| friction(c) && c.gain > WORTH_A_REFIT).map(|c| (*c).clone()));
+            }
+            shortlist.append(&mut worth);
         }
         shortlist
     }
@@ -416,9 +422,11 @@ impl Selector<'_> {
         Ok(Trial { addition, additions, gain, hypothesis, fits: vec![(places, fitted)] })
     }
 
-    /// The stop at the closed end, if the effect pulls there and the joint was there.
+    /// The stop at the closed end, if the effect pulls there or holds, and the joint was there.
     fn closed_stop(&self, addition: Addition) -> Option<Addition> {
         let joint = match addition {
+            // Else what differs by direction would have the stop as an argument for it.
+            Addition::Friction(joint) => joint,
             Addition::Effect(
                 joint,
                 EffectKind::Catch

@@ -14,7 +14,7 @@ use super::sampling::{Chain, SamplingSettings};
 use super::solver::Failure;
 
 /// Share of trajectories to accept.
-const TARGET: f64 = 0.8;
+const TARGET: f64 = 0.95;
 /// An energy error beyond this is a lost trajectory.
 const DIVERGED: f64 = 1000.0;
 /// Length of a trajectory.

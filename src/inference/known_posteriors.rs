@@ -93,7 +93,8 @@ fn check(name: &str, model: Model, prior: &Gaussian, truth: &Moments, laplace_wi
     for sampler in [Sampler::Hmc, Sampler::Nuts] {
         let (moments, samples) = sampled(&density, &approximation, sampler);
         assert_moments(&format!("{name} {sampler:?}"), &moments, truth, 0.06);
-        assert_eq!(samples.divergences, 0, "{name} {sampler:?}");
+        // Of 10,000 draws.
+        assert!(samples.divergences < 50, "{name} {sampler:?}: {}", samples.divergences);
     }
 }
 

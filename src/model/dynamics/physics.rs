@@ -15,14 +15,14 @@ use crate::model::KinematicFit;
 use crate::types::Label;
 
 impl DynamicsLearner {
-    /// The windows in which joints move, in joint space; of those that move the same joints, the
-    /// last `most`.
+    /// The windows in which one joint moves, in joint space; of each joint the last `most`. Where several
+    /// move, what a wrong hypothesis of one does to the others costs seconds to find out, and misleads.
     pub fn batch(&self, fit: &KinematicFit, input: &DynamicsInput<'_>, most: usize) -> Vec<BatchWindow> {
         let kinematics = kinematics_of(fit);
         let mut batch: Vec<BatchWindow> = Vec::new();
         for index in (0..input.windows.len().min(self.windows.len())).rev() {
             let (moving, frozen) = self.moving(index, fit, input);
-            if moving.is_empty() || batch.iter().filter(|w| w.moving == moving).count() >= most {
+            if moving.len() != 1 || batch.iter().filter(|w| w.moving == moving).count() >= most {
                 continue;
             }
             let Some(mut track) = joint_track(&self.source(index, &moving, fit, input), &kinematics) else { continue };

@@ -5,6 +5,7 @@ use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use super::layout::{CENTER, DAMPING, FRICTION, INERTIA, LOWER, MASS, UPPER};
 use super::learner::DynamicsLearner;
 use crate::inference::Failure;
+use crate::mechanism::effects::EffectKind;
 use crate::mechanism::{JointType, Tree};
 use crate::types::Label;
 use crate::types::posterior::{InformedBy, Quantity};
@@ -94,11 +95,26 @@ impl DynamicsLearner {
                     Quantity::from_normal(units[3], posterior.mean[at + entry], deviation(entry), InformedBy::Dynamics)
                 })
             };
-            let (inertia, inertia_deviation) = self.joint_inertia(k, &posterior.mean, &posterior.covariance)?;
+            let (mean, covariance) = (&posterior.mean, &posterior.covariance);
+            let (inertia, inertia_deviation) = self.log_of(mean, covariance, |tree| tree.joint_inertia(k))?;
+            // Where damping and friction differ by direction, their means over both are published.
+            let by_direction = model.effects.iter().position(|e| e.kind == EffectKind::AsymmetricFriction);
+            let resisting = |unit: &str, entry: usize, first: usize| match by_direction {
+                None => Ok(log_normal(unit, entry)),
+                Some(effect) => {
+                    let mean_of = |tree: &Tree<f64>| {
+                        let both = &tree.bodies()[k].parameters.effects[effect].parameters[first..first + 2];
+                        0.5 * (both[0] + both[1])
+                    };
+                    let (value, deviation) = self.log_of(mean, covariance, mean_of)?;
+                    let deviation = deviation.hypot(MODEL_FLOOR);
+                    Ok(Quantity::from_log_normal(unit, value, deviation, InformedBy::Dynamics))
+                }
+            };
             posterior.joints.push(JointDynamics {
                 label: model.joint.child,
-                damping: log_normal(units[0], DAMPING),
-                friction: log_normal(units[1], FRICTION),
+                damping: resisting(units[0], DAMPING, 2)?,
+                friction: resisting(units[1], FRICTION, 0)?,
                 joint_inertia: Quantity::from_log_normal(
                     units[2],
                     inertia,
@@ -134,18 +150,18 @@ impl DynamicsLearner {
         Ok(posterior)
     }
 
-    /// ln M_jj at q = 0 and its standard deviation.
-    fn joint_inertia(
+    /// The logarithm of a positive number of the tree at q = 0, and its standard deviation.
+    fn log_of(
         &self,
-        joint: usize,
         mean: &DVector<f64>,
         covariance: &DMatrix<f64>,
+        number: impl Fn(&Tree<f64>) -> f64,
     ) -> Result<(f64, f64), Failure> {
         let axes: Vec<_> = self.mechanism.joints.iter().map(|m| m.joint.axis).collect();
         let value = |x: &DVector<f64>| {
             let tree = self.mechanism.tree(x.as_slice(), &axes, &vec![None; axes.len()])?;
-            let inertia = tree.joint_inertia(joint);
-            if inertia > 0.0 { Ok(inertia.ln()) } else { Err(Failure::Diverged) }
+            let number = number(&tree);
+            if number > 0.0 { Ok(number.ln()) } else { Err(Failure::Diverged) }
         };
         let here = value(mean)?;
         let slope = DVector::from_iterator(
