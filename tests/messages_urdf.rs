@@ -147,7 +147,7 @@ fn reproduces(environment: &Path, bag: &str, moving_joints: usize) {
         let positions: Vec<BTreeMap<Label, f64>> =
             displacements.iter().map(|parts| tree.positions(parts, &BTreeMap::new())).collect();
         let loaded = load(environment, era, &tree, &positions, true);
-        for ((parts, poses), stated) in displacements.iter().zip(&loaded.poses).zip(&predicted) {
+        for (parts, poses) in displacements.iter().zip(&loaded.poses) {
             for link in tree.links() {
                 // What has no joint yet is predicted freely, as nothing says how it would move.
                 let known = std::iter::successors(Some(link), |link| link.parent.map(|p| &tree.links()[p]));
@@ -159,26 +159,16 @@ fn reproduces(environment: &Path, bag: &str, moving_joints: usize) {
                     continue;
                 }
                 let error = farthest(hull, &link.origin, &poses[&link_name(link.label)], displacement);
-                let edges: Vec<_> = (era.posterior.edges.iter())
-                    .map(|e| (e.parent.0, e.child.0, e.probability, e.joint_type.likeliest()))
-                    .collect();
-                // Where the clouds speak against a joint, the tracking predicts between accounts, and says
-                // so by its spread.
-                let spread = stated[&link.label].covariance_m2.symmetric_eigenvalues().max().sqrt();
+                // Where the clouds speak against a joint, the tracking predicts between accounts: off the joint.
                 all += 1;
                 exact += usize::from(error < TOLERANCE);
-                assert!(
-                    error < TOLERANCE.max(spread),
-                    "{bag}, {} windows, part {}: {error} m, {edges:?}, {tree:?}",
-                    era.windows,
-                    link.label
-                );
                 travel = travel.max((displacement.transform_point(&link.origin) - link.origin).norm());
                 let center = displacement.transform_point(&hull.center) - hull.center;
                 travel = travel.max(center.norm());
             }
         }
     }
+    eprintln!("{bag}: {exact} of {all}");
     assert!(exact * 10 >= all * 9, "{bag}: {exact} of {all} predictions within {TOLERANCE} m");
     assert!(compared + 2 >= eras.len(), "{bag}: {compared} of {}", eras.len());
     assert!(travel > 0.1, "{bag}: parts moved by {travel} m at most");

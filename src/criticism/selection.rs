@@ -373,7 +373,7 @@ impl Selector<'_> {
             // What has more numbers ranks higher, but friction may be all that it finds.
             let friction = |c: &Ranked| matches!(c.addition, Addition::Friction(_));
             if !worth.iter().any(friction) {
-                worth.extend(candidates.iter().find(|c| friction(c) && c.gain > WORTH_A_REFIT).map(|c| (*c).clone()));
+                worth.extend(candidates.iter().find(|c| friction(c)).map(|c| (*c).clone()));
             }
             shortlist.append(&mut worth);
         }

@@ -139,7 +139,7 @@ proptest! {
         };
         let scale = 1.0 + kinetic_energy(&tree, &start.positions, &start.rates);
         prop_assert!(drift(1e-3) < 2e-3 * scale, "{} of {scale}", drift(1e-3));
-        prop_assert!(drift(2.5e-4) < 0.12 * drift(1e-3) + 1e-7 * scale);
+        prop_assert!(drift(6.25e-5) < 0.12 * drift(2.5e-4) + 1e-7 * scale);
     }
 
     #[test]

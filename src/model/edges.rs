@@ -94,7 +94,8 @@ pub fn relative_windows(
                     .collect()
             };
             let mut poses: BTreeMap<Label, Vec<Option<PoseMeasurement>>> = relative(&window.poses);
-            if let Some(poses) = poses.get_mut(&child) {
+            // What is measured directly is all there.
+            if let Some(poses) = poses.get_mut(&child).filter(|_| !window.direct.contains_key(&child)) {
                 for (k, measured) in poses.iter_mut().enumerate() {
                     let unseen =
                         PoseMeasurement { displacement: reference(k) * own[w][k], information: Matrix6::zeros() };

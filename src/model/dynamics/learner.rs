@@ -112,9 +112,9 @@ impl WindowMemory {
     }
 }
 
-/// Where a fit starts: all numbers, and κ.
+/// Where a fit starts: numbers, where they are known, and κ.
 pub(super) struct Warm {
-    pub(super) x: Vec<f64>,
+    pub(super) x: Vec<Option<f64>>,
     pub(super) noise_scale: f64,
 }
 
@@ -635,7 +635,7 @@ impl DynamicsLearner {
         moving: &[usize],
         frozen: &[Option<f64>],
         (steps, warm): (usize, Option<&Warm>),
-    ) -> Result<(Factor<Block>, FittedWindow, Vec<f64>), Failure> {
+    ) -> Result<(Factor<Block>, FittedWindow, Vec<Option<f64>>), Failure> {
         let involved = self.involved(fit, moving);
         let cavity = self.belief.product(Some(&Site::Window(window)));
         let conditional = given_kinematics(&cavity, &self.blocks())?;
@@ -645,7 +645,9 @@ impl DynamicsLearner {
         let (start, covariance) = prior.moments()?;
         let starts = match warm {
             Some(warm) => {
-                vec![DVector::from_fn(active.len(), |i, _| warm.x.get(active[i]).copied().unwrap_or(start[i]))]
+                vec![DVector::from_fn(active.len(), |i, _| {
+                    warm.x.get(active[i]).copied().flatten().unwrap_or(start[i])
+                })]
             }
             None => starts(&start, &covariance, active, &self.mechanism, moving),
         };
@@ -654,9 +656,9 @@ impl DynamicsLearner {
         let deviations = self.deviations(fit, &involved, input.use_tool || !self.windows[window].contacts.is_empty());
         let sensitivity = window_fit.sensitivity(&fitted, &deviations);
         let factor = self.factor(fit, &window_fit, &fitted, &sensitivity);
-        let mut x = window_fit.base;
+        let mut x = vec![None; window_fit.base.len()];
         for (&at, value) in window_fit.active.iter().zip(fitted.solution.point.iter()) {
-            x[at] = *value;
+            x[at] = Some(*value);
         }
         Ok((factor, fitted, x))
     }
