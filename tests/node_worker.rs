@@ -17,7 +17,7 @@ fn inputs() -> Vec<Input> {
     let mut bag = Bag::open(&path).unwrap();
     let mut ingest = Ingest::new(&Config::default().input);
     let mut inputs = Vec::new();
-    while let Some(message) = bag.next() {
+    for message in bag {
         inputs.extend(ingest.push(&message.topic.name, &message.topic.type_name, message.bytes()));
     }
     let first = inputs.iter().map(Input::stamp).min().unwrap();

@@ -49,7 +49,7 @@ pub fn effects(
     // By how much each is needed: probabilities near one do not tell them apart.
     found.sort_by(|a, b| b.0.total_cmp(&a.0));
     let mut effects: Vec<EffectPosterior> = found.into_iter().map(|(_, effect)| effect).collect();
-    effects.sort_by(|a, b| (b.probability > 0.3).cmp(&(a.probability > 0.3)));
+    effects.sort_by_key(|effect| std::cmp::Reverse(effect.probability > 0.3));
     effects
 }
 

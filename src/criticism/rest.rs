@@ -50,7 +50,7 @@ impl RestReadings {
         if readings[0].len() < FEWEST {
             return None;
         }
-        let moments = readings.map(|values| robust_mean(values));
+        let moments = readings.map(robust_mean);
         Some(Self { mean: moments.map(|m| m.0), deviation: moments.map(|m| m.1) })
     }
 

@@ -305,7 +305,7 @@ impl Forecaster {
 
     /// What is known now: the joints, the parts by themselves, the last frame. `None` without a joint.
     pub fn knowledge(&self) -> Option<(Filter, BTreeMap<Label, FreePart>, Frame)> {
-        let free = self.told.iter().map(|(label, told)| (*label, told.free.clone())).collect();
+        let free = self.told.iter().map(|(label, told)| (*label, told.free)).collect();
         Some((self.filter.clone()?, free, self.seen.back()?.frame.clone()))
     }
 

@@ -129,7 +129,7 @@ mod tests {
     use super::*;
 
     fn scan(points: usize) -> Vec<ScanPoint> {
-        let viewpoint = |i: usize| (i % 3 > 0).then(|| Vector3::repeat(0.1 * (i % 3) as f64));
+        let viewpoint = |i: usize| (!i.is_multiple_of(3)).then(|| Vector3::repeat(0.1 * (i % 3) as f64));
         (0..points)
             .map(|i| ScanPoint {
                 point_in_world: Vector3::new(0.01 * i as f64, (i as f64).sin(), 1.0 / (i as f64 + 3.0)),

@@ -90,7 +90,7 @@ pub fn markers(picture: &Picture<'_>, frame: &FixedFrame, stamp: Stamp) -> Vec<M
 
 /// What removes everything shown before, as after a reset.
 pub fn no_markers(frame: &FixedFrame, stamp: Stamp) -> MarkerArray {
-    let marker = Marker { header: frame.header(stamp), action: i32::from(Marker::DELETEALL), ..Marker::default() };
+    let marker = Marker { header: frame.header(stamp), action: Marker::DELETEALL, ..Marker::default() };
     MarkerArray { markers: vec![marker] }
 }
 
@@ -120,7 +120,7 @@ fn is_finite(marker: &Marker) -> bool {
 }
 
 fn deleted(marker: Marker) -> Marker {
-    Marker { action: i32::from(Marker::DELETE), ..marker }
+    Marker { action: Marker::DELETE, ..marker }
 }
 
 fn surface_marker(marker: Marker, surface: &Surface, color: ColorRGBA) -> Marker {
@@ -269,7 +269,7 @@ mod tests {
         assert_eq!(check_finite(&messages[0]), Ok(()));
         assert_eq!(find(&messages, "axes", 2).color, REVOLUTE);
         assert_eq!(find(&messages, "axes", 3).color, PRISMATIC);
-        assert_eq!(find(&messages, "axes", 1).action, i32::from(Marker::DELETE));
+        assert_eq!(find(&messages, "axes", 1).action, Marker::DELETE);
         assert_eq!(find(&messages, "parts", 1).points.len(), 36);
         let told = &find(&messages, "edges", 3).text;
         assert_eq!(told, "part 3\non 4 0.70: prismatic 1.00\non 1 0.30: prismatic 1.00");

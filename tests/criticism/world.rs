@@ -128,9 +128,10 @@ impl Object {
                 let (friction, damping) = (1.0 + size * u(0.8, 1.8), 1.0 + size * u(0., 1.));
                 effect(EffectKind::AsymmetricFriction, vec![f, f * friction, d, d * damping])
             }
-            "position_friction" => {
-                effect(EffectKind::PositionFriction, vec![size * f * u(0.5, 0.9), u(0.3, 0.8) * reach, u(0., 6.28)])
-            }
+            "position_friction" => effect(
+                EffectKind::PositionFriction,
+                vec![size * f * u(0.5, 0.9), u(0.3, 0.8) * reach, u(0., std::f64::consts::TAU)],
+            ),
             "gravity_offset" => effect(EffectKind::GravityOffset, vec![-size * u(1., 1.6) * f]),
             "impulse" => {
                 let force = if slide { u(6., 12.) } else { u(1.2, 2.5) };
@@ -456,7 +457,7 @@ fn hull(revolute: bool, inertia: f64) -> HullProperties {
 pub fn object(name: &str, size: f64, number: u64) -> (Object, ChaCha8Rng) {
     let salt = name.bytes().fold(7_u64, |sum, byte| sum.wrapping_mul(31).wrapping_add(u64::from(byte)));
     let mut rng = ChaCha8Rng::seed_from_u64(salt ^ (number << 32) ^ (size * 1000.0) as u64);
-    let revolute = number % 2 == 0;
+    let revolute = number.is_multiple_of(2);
     let object =
         if name == "plain" { Object::plain(&mut rng, revolute) } else { Object::with(&mut rng, revolute, name, size) };
     (object, rng)
