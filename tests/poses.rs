@@ -106,8 +106,8 @@ fn with_poses(path: &Path, labels: &[u32], clouds: bool, turns: bool) {
             let pose = displacement * Pose::from_translation(mover.frame) * Pose::exp(&error);
             let angular = if turns { NOISE.0.powi(2) } else { f64::INFINITY };
             let mut covariance = [[0.0; 6]; 6];
-            for i in 0..6 {
-                covariance[i][i] = if i < 3 { NOISE.1.powi(2) } else { angular };
+            for (i, row) in covariance.iter_mut().enumerate() {
+                row[i] = if i < 3 { NOISE.1.powi(2) } else { angular };
             }
             let raw = RawPose { position: pose.translation.into(), orientation: pose.quaternion().into() };
             let message = PoseWithCovarianceStamped {
@@ -142,7 +142,6 @@ fn learned(labels: &[u32], clouds: bool, turns: bool) -> ObjectPosterior {
         assert!(seen.lines().filter(|line| line.split(',').nth(1) == Some(&label.to_string())).count() > 200);
     }
     let document: PosteriorDocument = serde_json::from_str(&fs::read_to_string(posterior).unwrap()).unwrap();
-    eprintln!("{:?}", document.posterior.criticism);
     document.posterior
 }
 

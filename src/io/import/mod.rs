@@ -1,6 +1,6 @@
 //! Recorded tables of joint positions, poses or points and of forces → a bag that replay reads.
 //!
-//! A spec (TOML, [`spec`]) says what the columns are and what is known of the machine. Poses go to
+//! A spec (TOML, `spec`) says what the columns are and what is known of the machine. Poses go to
 //! `/parts/LABEL/pose`, wrenches to `/parts/LABEL/wrench`: what acts between two parts is a wrench on
 //! the one and its opposite on the other. The bag's world has gravity along −z.
 
