@@ -168,7 +168,6 @@ fn reproduces(environment: &Path, bag: &str, moving_joints: usize) {
             }
         }
     }
-    eprintln!("{bag}: {exact} of {all}");
     assert!(exact * 10 >= all * 9, "{bag}: {exact} of {all} predictions within {TOLERANCE} m");
     assert!(compared + 2 >= eras.len(), "{bag}: {compared} of {}", eras.len());
     assert!(travel > 0.1, "{bag}: parts moved by {travel} m at most");
