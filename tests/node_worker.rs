@@ -14,7 +14,7 @@ use bayesian_object_models::{
 /// The chain's first inputs, with a few windows in them.
 fn inputs() -> Vec<Input> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("bags/chain/chain.mcap");
-    let mut bag = Bag::open(&path).unwrap();
+    let bag = Bag::open(&path).unwrap();
     let mut ingest = Ingest::new(&Config::default().input);
     let mut inputs = Vec::new();
     for message in bag {
