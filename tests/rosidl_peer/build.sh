@@ -72,12 +72,16 @@ export LD_LIBRARY_PATH="$libraries\${LD_LIBRARY_PATH:+:\$LD_LIBRARY_PATH}"
 export ROS_DISTRO=jazzy ROS_VERSION=2 ROS_PYTHON_VERSION=3 RMW_IMPLEMENTATION=rmw_fastrtps_cpp
 END
 
+# CMake refuses include folders that are inside the sources, as those of an environment in target/ are: by this
+# name the sources are beside it.
+ln -sfn "$repository" "$folder/source"
+
 (
     source "$environment"
     # Not yet there: colcon would warn of it.
     export AMENT_PREFIX_PATH=$venv CMAKE_PREFIX_PATH=$venv PYTHONPATH=
     colcon --log-base "$folder/log" build \
-        --base-paths "$repository" "$here/tf2_msgs" --packages-select tf2_msgs bayesian_object_models \
+        --base-paths "$folder/source" "$here/tf2_msgs" --packages-select tf2_msgs bayesian_object_models \
         --build-base "$folder/build" --install-base "$folder/install" --event-handlers console_direct- \
         --cmake-args "-DBOM_BUILD_PROGRAM=$program" "-DBOM_CARGO_TARGET_DIR=$target" \
         -DBUILD_TESTING=OFF -DCMAKE_CXX_FLAGS=-O0 -DCMAKE_C_FLAGS=-O0 \
