@@ -3,6 +3,7 @@
 use nalgebra::{DMatrix, DVector};
 
 use crate::inference::Gaussian;
+use crate::math::median;
 use crate::model::{BatchWindow, DynamicsInput, SENSOR_SIZE};
 
 /// Readings this long before and after a contact do not count \[s\].
@@ -78,13 +79,11 @@ impl RestReadings {
 }
 
 /// Mean without what is far off, and its standard deviation.
-fn robust_mean(mut values: Vec<f64>) -> (f64, f64) {
-    values.sort_by(f64::total_cmp);
-    let median = values[values.len() / 2];
-    let mut distances: Vec<f64> = values.iter().map(|v| (v - median).abs()).collect();
-    distances.sort_by(f64::total_cmp);
-    let spread = (1.4826 * distances[distances.len() / 2]).max(1e-9);
-    let near: Vec<f64> = values.into_iter().filter(|v| (v - median).abs() < 4.0 * spread).collect();
+fn robust_mean(values: Vec<f64>) -> (f64, f64) {
+    let middle = median(values.clone()).unwrap_or(0.0);
+    let distances = values.iter().map(|v| (v - middle).abs()).collect();
+    let spread = (1.4826 * median(distances).unwrap_or(0.0)).max(1e-9);
+    let near: Vec<f64> = values.into_iter().filter(|v| (v - middle).abs() < 4.0 * spread).collect();
     let count = near.len().max(1) as f64;
     (near.iter().sum::<f64>() / count, (spread / count.sqrt()).hypot(FLOOR))
 }

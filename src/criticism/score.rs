@@ -8,6 +8,7 @@ use super::numbers::{Addition, Numbers, Workshop};
 use super::selection::{Component, Selection};
 use super::statistics::whiteness;
 use crate::inference::{Failure, Gaussian};
+use crate::math::median;
 use crate::mechanism::JointType;
 use crate::model::{BatchWindow, Hypothesis, WindowResidual};
 use crate::types::Label;
@@ -79,9 +80,7 @@ fn sequence(
         let scales: Vec<f64> = whole.windows[..k].iter().map(|w| w.noise_scale).collect();
         let learned = hypothesis.fit(&known, &x, &scales, (5, 0))?;
         x.clone_from(&learned.x);
-        let mut sorted = scales;
-        sorted.sort_by(f64::total_cmp);
-        let usual = sorted[sorted.len() / 2];
+        let usual = median(scales).ok_or(Failure::NoInformation)?;
         let mut posterior = hypothesis.clone();
         posterior.prior = learned_prior(hypothesis, &learned)?;
         // The mode of what the window says is sought from what was known and from what is known now.

@@ -7,27 +7,7 @@ pub fn chi_squared_tail(x: f64, freedom: f64) -> f64 {
     }
     let spread = 2.0 / (9.0 * freedom);
     let z = ((x / freedom).cbrt() - 1.0 + spread) / spread.sqrt();
-    0.5 * erfc(z / std::f64::consts::SQRT_2)
-}
-
-/// Complementary error function, to 1.2e-7 of itself (Press et al., "Numerical Recipes", 2nd edition, 6.2).
-fn erfc(x: f64) -> f64 {
-    const TERMS: [f64; 10] = [
-        -1.265_512_23,
-        1.000_023_68,
-        0.374_091_96,
-        0.096_784_18,
-        -0.186_288_06,
-        0.278_868_07,
-        -1.135_203_98,
-        1.488_515_87,
-        -0.822_152_23,
-        0.170_872_77,
-    ];
-    let t = 1.0 / (1.0 + 0.5 * x.abs());
-    let exponent = TERMS.iter().rev().fold(0.0, |sum, term| sum * t + term);
-    let tail = t * (exponent - x * x).exp();
-    if x >= 0.0 { tail } else { 2.0 - tail }
+    0.5 * libm::erfc(z / std::f64::consts::SQRT_2)
 }
 
 /// p-value of a series being white: Ljung, Box 1978, over `lags` lags, of series kept apart.

@@ -2,8 +2,10 @@
 
 #[doc(hidden)]
 pub mod gradient;
+mod numbers;
 mod scalar;
 mod se3;
 
+pub use numbers::{log_sum_exp, median, softmax};
 pub use scalar::Real;
 pub use se3::{Pose, Screw, orthonormal_pair, skew};

@@ -5,6 +5,8 @@
 
 use std::ops::Mul;
 
+use std::f64::consts::TAU;
+
 use nalgebra::{Matrix3, Matrix6, Rotation3, UnitQuaternion, Vector3, Vector6};
 use serde::{Deserialize, Serialize};
 
@@ -103,6 +105,14 @@ impl Pose<f64> {
     /// The rotation as a unit quaternion.
     pub fn quaternion(&self) -> UnitQuaternion<f64> {
         UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(self.rotation))
+    }
+
+    /// The angle by which this turns about a unit direction \[rad\]; of the angles that are the same, the
+    /// nearest to `near`.
+    pub fn turn_about(&self, direction: &Vector3<f64>, near: f64) -> f64 {
+        let rotation = self.quaternion();
+        let angle = 2.0 * rotation.imag().dot(direction).atan2(rotation.w);
+        angle + ((near - angle) / TAU).round() * TAU
     }
 
     /// Ad(self) as a 6×6 matrix on (angular, linear) twists.

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use super::kinematics::{Axis, KinematicJoint, KinematicSettings, fit_kinematics};
 use super::window::{Contact, PoseMeasurement, WindowObservations};
-use crate::math::{Pose, Screw, orthonormal_pair};
+use crate::math::{Pose, Screw, median, orthonormal_pair};
 use crate::mechanism::JointType;
 use crate::registration::{fit_circle, fit_line};
 use crate::types::Label;
@@ -295,10 +295,8 @@ fn start_positions(joint: &KinematicJoint, window: &WindowObservations, rests: b
             last
         })
         .collect();
-    if rests && !positions.is_empty() {
-        let mut sorted = positions.clone();
-        sorted.sort_by(f64::total_cmp);
-        positions.fill(sorted[sorted.len() / 2]);
+    if rests && let Some(place) = median(positions.clone()) {
+        positions.fill(place);
     }
     positions
 }
@@ -313,11 +311,7 @@ pub fn nearest_position(joint: &KinematicJoint, screw: &Screw, measured: &PoseMe
             let to = measured.point(&joint.center) - joint.axis.point;
             [start, joint.axis.direction.dot(&from.cross(&to)).atan2(from.dot(&to) - axial(joint, &from, &to))]
         }
-        JointType::Revolute => {
-            let rotation = measured.displacement.quaternion();
-            let turn = 2.0 * rotation.imag().dot(&joint.axis.direction).atan2(rotation.w);
-            [start, (turn + std::f64::consts::PI).rem_euclid(std::f64::consts::TAU) - std::f64::consts::PI]
-        }
+        JointType::Revolute => [start, measured.displacement.turn_about(&joint.axis.direction, 0.0)],
         _ => {
             let shift = measured.displacement.transform_point(&joint.center) - joint.center;
             [start, shift.dot(&joint.axis.direction)]

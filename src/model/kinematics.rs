@@ -9,7 +9,6 @@
 //! eliminated, so the cost is linear in the number of windows.
 
 use std::collections::BTreeMap;
-use std::f64::consts::PI;
 use std::rc::Rc;
 
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
@@ -87,11 +86,7 @@ impl KinematicJoint {
         match self.joint_type {
             JointType::Rigid => 0.0,
             JointType::Prismatic => direction.dot(&(displacement.transform_point(&self.center) - self.center)),
-            JointType::Revolute => {
-                let rotation = displacement.quaternion();
-                let angle = 2.0 * rotation.imag().dot(direction).atan2(rotation.w);
-                near + (angle - near + PI).rem_euclid(2.0 * PI) - PI
-            }
+            JointType::Revolute => displacement.turn_about(direction, near),
         }
     }
 

@@ -152,7 +152,7 @@ impl Forecaster {
             filter: None,
             denials: 0,
             last: BTreeMap::new(),
-            toucher: Toucher::default(),
+            toucher: Toucher::new(settings.windows.force_threshold_n),
             whereabouts: Whereabouts::default(),
             told: BTreeMap::new(),
             found: BTreeMap::new(),
@@ -442,7 +442,7 @@ impl Forecaster {
     fn next_push(&self, pending: &Pending) -> Option<f64> {
         let first = self.samples.partition_point(|s| s.stamp_s <= pending.time_s);
         let end = self.samples.partition_point(|s| s.stamp_s <= pending.time_s + HORIZONS[2] + 1e-9);
-        first_push(&self.samples[first..end.max(first)], &pending.rest_force)
+        first_push(&self.samples[first..end.max(first)], &pending.rest_force, self.toucher.threshold_n)
     }
 
     /// Judges what was predicted for now, by where the parts are found.

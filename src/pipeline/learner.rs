@@ -13,7 +13,7 @@ use super::poses::{POSED_RADIUS, PosedPart, measured_motion};
 use crate::criticism::Critic;
 use crate::geometry::{HullProperties, hull_properties};
 use crate::inference::SamplingSettings;
-use crate::math::Pose;
+use crate::math::{Pose, log_sum_exp};
 use crate::mechanism::JointType;
 use crate::model::{
     Axis, Contact, EdgeFit, EdgePart, KinematicFit, KinematicJoint, KinematicSettings, PoseMeasurement,
@@ -688,7 +688,7 @@ impl Learner {
                 let row = option.parent.map_or(Some(0), |p| movers.iter().position(|l| *l == p).map(|i| i + 1));
                 if let Some(row) = row {
                     let prior = self.log_contact_prior(movers[column], option.parent);
-                    weights[(row, column + 1)] = log_mean_exp(&option.log_evidence) + prior;
+                    weights[(row, column + 1)] = log_sum_exp(&option.log_evidence) + prior;
                 }
             }
         }
@@ -876,9 +876,4 @@ fn surface_gaps(parts: &BTreeMap<Label, PartModel>) -> BTreeMap<(Label, Label), 
         }
     }
     gaps
-}
-
-fn log_mean_exp(values: &[f64]) -> f64 {
-    let top = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    top + (values.iter().map(|v| (v - top).exp()).sum::<f64>() / values.len() as f64).ln()
 }

@@ -7,6 +7,7 @@ use nalgebra::{DMatrix, Matrix3, Vector3};
 use super::poses::POSED_RADIUS;
 use super::{Learner, ParentEvidence, Pipeline};
 use crate::geometry::{HullProperties, hull_properties};
+use crate::math::log_sum_exp;
 use crate::mechanism::JointType;
 use crate::model::{Axis, DynamicsPosterior, JointDynamics, KinematicFit};
 use crate::registration::PartModel;
@@ -137,7 +138,7 @@ fn edges(root: Label, labels: &[Label], known: Option<Known<'_>>) -> Vec<EdgePos
         for (i, parent) in nodes.iter().enumerate() {
             let moved = evidence(*parent).is_some();
             log_weights[(i, j)] =
-                option_for(options, *parent, moved).map_or(f64::NEG_INFINITY, |o| log_sum(&o.log_evidence));
+                option_for(options, *parent, moved).map_or(f64::NEG_INFINITY, |o| log_sum_exp(&o.log_evidence));
         }
     }
     let Ok(trees) = TreeDistribution::new(&log_weights) else { return Vec::new() };
@@ -163,11 +164,6 @@ fn option_for(options: &[ParentEvidence], parent: Label, parent_moved: bool) -> 
     options.iter().find(|o| o.parent == parent_moved.then_some(parent))
 }
 
-fn log_sum(terms: &[f64; 3]) -> f64 {
-    let top = terms.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    top + terms.iter().map(|t| (t - top).exp()).sum::<f64>().ln()
-}
-
 fn edge(
     parent: Label,
     child: Label,
@@ -177,7 +173,7 @@ fn edge(
 ) -> EdgePosterior {
     let mut joint_type = JointTypeProbabilities::UNIFORM;
     if let Some(option) = option {
-        let total = log_sum(&option.log_evidence);
+        let total = log_sum_exp(&option.log_evidence);
         let [rigid, prismatic, revolute] = option.log_evidence.map(|e| (e - total).exp());
         let doubt = known.map_or(0.0, |known| known.learner.doubt(child));
         let mixed = |p: f64| (1.0 - doubt) * p + doubt / 3.0;

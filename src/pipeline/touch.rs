@@ -12,8 +12,6 @@ use crate::types::Label;
 const SMOOTHING: usize = 4;
 /// Contact outlives the force by this \[s\].
 const RELEASE: f64 = 0.2;
-/// Force beyond the rest reading that means contact \[N\].
-const CONTACT_FORCE: f64 = 0.3;
 /// Least and first standard deviation of the tool's reported position \[m\].
 const TOOL_SIGMA: (f64, f64) = (0.0002, 0.001);
 
@@ -31,11 +29,11 @@ pub(super) struct Touch {
     pub pushes: bool,
 }
 
-/// When the first of some readings pushes, smoothed as for contact \[s\].
-pub(super) fn first_push(samples: &[WrenchSample], rest_force: &Vector3<f64>) -> Option<f64> {
+/// When the first of some readings pushes beyond `threshold_n` \[N\], smoothed as for contact \[s\].
+pub(super) fn first_push(samples: &[WrenchSample], rest_force: &Vector3<f64>, threshold_n: f64) -> Option<f64> {
     samples.windows(2 * SMOOTHING + 1).find_map(|around| {
         let mean = around.iter().map(|s| s.force_in_world).sum::<Vector3<f64>>() / around.len() as f64;
-        ((mean - rest_force).norm() > CONTACT_FORCE).then_some(around[SMOOTHING].stamp_s)
+        ((mean - rest_force).norm() > threshold_n).then_some(around[SMOOTHING].stamp_s)
     })
 }
 
@@ -49,6 +47,8 @@ struct ContactNow {
 
 /// Finds contacts in the readings.
 pub(super) struct Toucher {
+    /// Force beyond the rest reading that means contact \[N\].
+    pub threshold_n: f64,
     /// The part that the wrench is bound to, if any.
     pub bound: Option<Label>,
     contact: Option<ContactNow>,
@@ -61,9 +61,11 @@ pub(super) struct Toucher {
     tool_variance: f64,
 }
 
-impl Default for Toucher {
-    fn default() -> Self {
+impl Toucher {
+    /// Nothing touched; contact is a force of `threshold_n` \[N\] beyond the rest reading.
+    pub fn new(threshold_n: f64) -> Self {
         Self {
+            threshold_n,
             bound: None,
             contact: None,
             let_go: Vec::new(),
@@ -72,9 +74,7 @@ impl Default for Toucher {
             tool_variance: TOOL_SIGMA.1.powi(2),
         }
     }
-}
 
-impl Toucher {
     /// Standard deviation of the tool's reported position \[m\].
     pub fn tool_sigma(&self) -> f64 {
         self.tool_variance.sqrt().max(TOOL_SIGMA.0)
@@ -116,7 +116,7 @@ impl Toucher {
         for i in first..end {
             let around = &samples[i.saturating_sub(SMOOTHING)..(i + SMOOTHING + 1).min(end)];
             let mean = around.iter().map(|s| s.force_in_world).sum::<Vector3<f64>>() / around.len() as f64;
-            let pushes = (mean - rest_force).norm() > CONTACT_FORCE;
+            let pushes = (mean - rest_force).norm() > self.threshold_n;
             let sample = samples[i];
             if i >= 3 {
                 // Third differences of white noise have 20 times its variance; of a motion, next to none.

@@ -177,11 +177,7 @@ impl JointAxis {
     fn position(&self, relative: &Pose, center: &Vector3<f64>, last: f64) -> f64 {
         match self {
             Self::Slide { direction } => (relative.transform_point(center) - center).dot(direction),
-            Self::Hinge { direction, .. } => {
-                let rotation = relative.quaternion();
-                let angle = 2.0 * rotation.imag().dot(direction).atan2(rotation.w);
-                angle + ((last - angle) / std::f64::consts::TAU).round() * std::f64::consts::TAU
-            }
+            Self::Hinge { direction, .. } => relative.turn_about(direction, last),
         }
     }
 

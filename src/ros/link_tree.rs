@@ -77,13 +77,7 @@ impl LinkJoint {
         match self {
             Self::Fixed => None,
             Self::Prismatic { direction } => Some(direction.dot(&(relative.transform_point(origin) - origin))),
-            Self::Revolute { direction, .. } => {
-                let r = &relative.rotation;
-                let odd = Vector3::new(r[(2, 1)] - r[(1, 2)], r[(0, 2)] - r[(2, 0)], r[(1, 0)] - r[(0, 1)]);
-                let angle = odd.dot(direction).atan2(r.trace() - direction.dot(&(r * direction)));
-                let turn = std::f64::consts::TAU;
-                Some(angle + turn * ((near - angle) / turn).round())
-            }
+            Self::Revolute { direction, .. } => Some(relative.turn_about(direction, near)),
         }
     }
 }

@@ -19,6 +19,8 @@ use nalgebra::{DMatrix, DVector};
 use rand::{Rng, RngExt};
 use rand_distr::Gumbel;
 
+use crate::math::softmax;
+
 use super::Tree;
 
 /// Parameters of the relaxed sampler.
@@ -179,15 +181,6 @@ fn standard_gumbel(rng: &mut dyn Rng) -> f64 {
         Ok(gumbel) => rng.sample(gumbel),
         Err(error) => unreachable!("location 0 and scale 1 are valid: {error}"),
     }
-}
-
-/// exp(x_i) / Σ exp(x_k), without overflow.
-pub(super) fn softmax(logits: impl Iterator<Item = f64> + Clone) -> Vec<f64> {
-    let largest = logits.clone().fold(f64::NEG_INFINITY, f64::max);
-    let mut values: Vec<f64> = logits.map(|logit| (logit - largest).exp()).collect();
-    let total: f64 = values.iter().sum();
-    values.iter_mut().for_each(|value| *value /= total);
-    values
 }
 
 #[cfg(test)]

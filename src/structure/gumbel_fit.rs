@@ -14,8 +14,8 @@
 use nalgebra::{DMatrix, DVector};
 use rand::Rng;
 
-use super::gumbel::softmax;
 use super::{FitStep, GumbelDraw, GumbelGradient, GumbelParameters, StructureError, Tree, TreeGuide, TreeTarget};
+use crate::math::softmax;
 
 /// A worse re-parenting than this [nats] is as good as impossible: exp(−50) = 2e-22.
 const WORST_GAIN: f64 = -50.0;

@@ -4,7 +4,7 @@
 //! where its pose is known, smoothed over frames: P(account) ∝ prior · exp(−N · excess). Poses are not
 //! registered for this, so that nothing slides to where it fits.
 
-use crate::math::Pose;
+use crate::math::{Pose, softmax};
 use crate::registration::{PartModel, ScanPoint, truncated_cost};
 
 /// Points of a scan looked at.
@@ -85,12 +85,10 @@ impl Presence {
             let own = account.log_prior() + lost - INDEPENDENT * self.excess(account).unwrap_or(0.0);
             if there[account as usize] { own } else { f64::NEG_INFINITY }
         });
-        let top = logs.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        if !top.is_finite() {
+        if there == [false; 3] {
             return [0.0; 3];
         }
-        let weights = logs.map(|log| (log - top).exp());
-        let sum: f64 = weights.iter().sum();
-        weights.map(|weight| weight / sum)
+        let weights = softmax(logs.into_iter());
+        std::array::from_fn(|account| weights[account])
     }
 }

@@ -4,6 +4,8 @@
 //! their marginal density is ∝ (b + ½ Σ ω e²)^−(a + ½ Σ ω), ω fading (Student-t). P(way) ∝ prior ·
 //! that, and b' / (a' − 1) is the variance that the way has shown.
 
+use crate::math::softmax;
+
 /// Ways to predict.
 pub const WAYS: usize = 3;
 /// The simulated mechanism; its rates, fading; rest.
@@ -40,10 +42,9 @@ impl Skill {
     pub fn weights(&self, usual_m: f64) -> [(f64, f64); WAYS] {
         let shape = SHAPE + 0.5 * self.count;
         let scale = |way: usize| SHAPE * usual_m * usual_m + 0.5 * self.squares[way];
-        let logs: Vec<f64> = (0..WAYS).map(|way| PRIORS[way].ln() - shape * scale(way).ln()).collect();
-        let top = logs.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        let sum: f64 = logs.iter().map(|log| (log - top).exp()).sum();
-        std::array::from_fn(|way| ((logs[way] - top).exp() / sum, scale(way) / (shape - 1.0).max(0.5)))
+        let logs = (0..WAYS).map(|way| PRIORS[way].ln() - shape * scale(way).ln());
+        let shares = softmax(logs);
+        std::array::from_fn(|way| (shares[way], scale(way) / (shape - 1.0).max(0.5)))
     }
 }
 

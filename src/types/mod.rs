@@ -81,23 +81,6 @@ pub struct AppliedWrench {
     pub torque_in_world: Vector3<f64>,
 }
 
-/// A part's displacement since the first frame, with its information.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct PartObservation {
-    /// When it was seen.
-    pub stamp: Stamp,
-    /// The part.
-    pub label: Label,
-    /// D: the part's point p at the first frame is now at D·p, world frame.
-    pub displacement: Pose,
-    /// Information of the right-hand error ξ in `truth = T(c)·exp(ξ)·T(−c)·displacement` with
-    /// ξ = (angular \[rad\], linear \[m\]), c the current position of `reference_point`.
-    /// Zero rows mark what was not observed.
-    pub information: Matrix6<f64>,
-    /// The point of the part at the first frame that the information is centred on \[m\].
-    pub reference_point: Vector3<f64>,
-}
-
 /// A part's pose from a topic that measures it directly, instead of clouds.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MeasuredPose {

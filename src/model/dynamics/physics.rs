@@ -10,6 +10,7 @@ use super::learner::{
 };
 use super::track::{JointTrack, joint_track};
 use crate::inference::{Failure, Gaussian};
+use crate::math::median;
 use crate::mechanism::effects::EffectKind;
 use crate::model::KinematicFit;
 use crate::types::Label;
@@ -195,14 +196,11 @@ fn drop_spikes(track: &mut JointTrack) {
         let path: Vec<f64> = track.positions.iter().map(|q| q[joint]).collect();
         let distance = |k: usize| {
             let first = k.saturating_sub(2).min(count.saturating_sub(5));
-            let mut around = path[first..(first + 5).min(count)].to_vec();
-            around.sort_by(f64::total_cmp);
-            (path[k] - around[around.len() / 2]).abs()
+            let around = path[first..(first + 5).min(count)].to_vec();
+            median(around).map_or(0.0, |middle| (path[k] - middle).abs())
         };
         let distances: Vec<f64> = (0..count).map(distance).collect();
-        let mut sorted = distances.clone();
-        sorted.sort_by(f64::total_cmp);
-        let usual = sorted.get(count / 2).copied().unwrap_or(0.0);
+        let usual = median(distances.clone()).unwrap_or(0.0);
         for (spike, distance) in spikes.iter_mut().zip(distances) {
             *spike |= distance > (SPIKE.0 * usual).max(SPIKE.1);
         }

@@ -11,7 +11,7 @@ use std::collections::BTreeSet;
 
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
 
-use crate::math::Pose;
+use crate::math::{Pose, median};
 use crate::mechanism::WrenchSample;
 use crate::model::{Axis, Contact, KinematicJoint, WindowObservations};
 use crate::types::{AppliedWrench, Label, Stamp};
@@ -265,14 +265,9 @@ fn with_ends(mut samples: Vec<WrenchSample>) -> Vec<WrenchSample> {
 
 /// Standard deviation, per axis, about quadratics over runs of 9 readings.
 fn local_deviation(track: &[(f64, Vector3<f64>)]) -> f64 {
-    let mut variances: Vec<f64> = track.chunks_exact(9).filter_map(run_variance).collect();
-    if variances.is_empty() {
-        return 0.0;
-    }
-    let middle = variances.len() / 2;
-    variances.sort_by(f64::total_cmp);
+    let usual = median(track.chunks_exact(9).filter_map(run_variance).collect());
     // The median of a χ² of 18 degrees of freedom is .963 of its mean.
-    (variances[middle] / 0.963).sqrt()
+    usual.map_or(0.0, |variance| (variance / 0.963).sqrt())
 }
 
 fn run_variance(run: &[(f64, Vector3<f64>)]) -> Option<f64> {
