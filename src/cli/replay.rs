@@ -303,7 +303,7 @@ impl Replay {
                 Outputs::write_row(&mut files.predictions, &row)?;
             }
             // A replay learns in the stream.
-            Output::WindowClosed(_) => {}
+            Output::FirstLook(_) | Output::WindowClosed(_) | Output::Tracked { .. } => {}
             Output::Learned { span_s } => tracing::info!(from_s = span_s.0, to_s = span_s.1, "window learned"),
             Output::Resumed { root, unexplained, unknown } => self.taken_up(*root, unexplained, unknown)?,
         }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use nalgebra::Vector3;
+use nalgebra::{Vector3, Vector6};
 use tracing::warn;
 
 use super::drawing::{Drawing, Model, Scene};
@@ -31,6 +31,8 @@ pub struct Announcer {
     frame: FixedFrame,
     model: Option<Arc<Model>>,
     displacements: BTreeMap<Label, Pose>,
+    /// Twists of the parts' joints against their parents.
+    twists: BTreeMap<Label, Vector6<f64>>,
     /// Joint positions, to count turns.
     positions: BTreeMap<Label, f64>,
     /// Whether a window was learned.
@@ -48,6 +50,7 @@ impl Announcer {
             frame: FixedFrame { name: fixed_frame, zero: Stamp::default() },
             model: None,
             displacements: BTreeMap::new(),
+            twists: BTreeMap::new(),
             positions: BTreeMap::new(),
             learned: false,
             tf: false,
@@ -60,6 +63,7 @@ impl Announcer {
         self.frame = FixedFrame { name: fixed_frame.to_owned(), zero: Stamp::default() };
         (self.model, self.learned, self.drawn) = (None, false, None);
         self.displacements.clear();
+        self.twists.clear();
         self.positions.clear();
     }
 
@@ -80,9 +84,10 @@ impl Announcer {
         parts.iter().find(|part| part.label == label).map(|part| part.com_in_world_m.into())
     }
 
-    /// Where a part is.
-    pub fn observed(&mut self, label: Label, displacement: Pose) {
+    /// Where a part is, and the twist of its joint against its parent, (angular \[rad/s\], linear \[m/s\]).
+    pub fn observed(&mut self, label: Label, displacement: Pose, twist: Vector6<f64>) {
         self.displacements.insert(label, displacement);
+        self.twists.insert(label, twist);
     }
 
     /// A frame was seen: where the joints are by now. Until something is learned, the prior goes with
@@ -108,7 +113,8 @@ impl Announcer {
     fn say_state(&mut self, stamp: Stamp) {
         let Some(model) = &self.model else { return };
         self.positions = model.tree.positions(&self.displacements, &self.positions);
-        let states = joint_states(&model.tree, &self.positions, &BTreeMap::new(), &self.frame, stamp);
+        let rates = model.tree.rates(&self.twists);
+        let states = joint_states(&model.tree, &self.positions, &rates, &self.frame, stamp);
         self.outputs.send(Publication::JointStates(states));
         if self.tf {
             let transforms = link_transforms(&model.tree, &self.displacements, &self.frame, stamp);
@@ -137,13 +143,13 @@ impl Announcer {
     }
 
     /// A window was learned.
-    pub fn learned(&mut self, pipeline: &Pipeline, learned: &Learned, counters: &Counters, shift_ns: i64) {
+    pub fn learned(&mut self, pipeline: &Pipeline, learned: Learned, counters: &Counters, shift_ns: i64) {
         self.learned = true;
         let zero = pipeline.zero().unwrap_or_default();
         self.frame.zero = Stamp(zero.0 - shift_ns);
         let stamp = self.frame.zero.plus_seconds(learned.span_s.1);
-        let (hulls, ranges) = (learned.hulls.clone(), learned.ranges_seen.clone());
-        self.believe(learned.posterior.clone(), hulls, ranges, counters, stamp);
+        let Learned { posterior, hulls, ranges_seen, .. } = learned;
+        self.believe(posterior, hulls, ranges_seen, counters, stamp);
     }
 
     fn believe(

@@ -1,6 +1,7 @@
 //! What the node says, and how it gets onto the network: everything below 100 KB, or counted.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Instant;
 
 use ros2_client::Publisher;
@@ -18,7 +19,7 @@ use super::participant::{Participant, Quality};
 use crate::io::counters::Counters;
 use crate::ros::{MOST_BYTES, encoded_bytes, messages};
 
-/// Messages that wait for the network at most.
+/// Messages that wait for the network at most, of those that cannot wait and of the others.
 const MOST_WAITING: usize = 256;
 
 /// One message.
@@ -38,17 +39,26 @@ pub enum Publication {
     ParameterEvent(ParameterEvent),
 }
 
-/// Hands messages to the task that sends them; cheap to share.
+impl Publication {
+    /// Whether it goes with every cloud: it is small, and does not wait for what is large.
+    fn is_urgent(&self) -> bool {
+        matches!(self, Self::Predicted(..) | Self::JointStates(_) | Self::Tf(_))
+    }
+}
+
+/// Hands messages to the tasks that send them; cheap to share.
 #[derive(Clone)]
 pub struct Outputs {
-    sender: mpsc::Sender<Publication>,
+    urgent: mpsc::Sender<Publication>,
+    others: mpsc::Sender<Publication>,
     health: SharedHealth,
 }
 
 impl Outputs {
     /// Hands over a message; where too many wait it is dropped and counted.
     pub fn send(&self, publication: Publication) {
-        if self.sender.try_send(publication).is_err() {
+        let sender = if publication.is_urgent() { &self.urgent } else { &self.others };
+        if sender.try_send(publication).is_err() {
             Counters::add(&mut self.health.lock().unsent, "the network is behind", 1);
         }
     }
@@ -109,16 +119,21 @@ impl Publishers {
         })
     }
 
-    /// Starts the task that sends; it ends when nothing can be handed over any more.
+    /// Starts the tasks that send; they end when nothing can be handed over any more.
     pub fn start(self) -> Outputs {
-        let (sender, mut waiting) = mpsc::channel(MOST_WAITING);
         let health = self.health.clone();
-        tokio::spawn(async move {
-            while let Some(publication) = waiting.recv().await {
-                self.publish(publication).await;
-            }
+        let publishers = Arc::new(self);
+        let [urgent, others] = [(), ()].map(|()| {
+            let (sender, mut waiting) = mpsc::channel(MOST_WAITING);
+            let publishers = Arc::clone(&publishers);
+            tokio::spawn(async move {
+                while let Some(publication) = waiting.recv().await {
+                    publishers.publish(publication).await;
+                }
+            });
+            sender
         });
-        Outputs { sender, health }
+        Outputs { urgent, others, health }
     }
 
     async fn publish(&self, publication: Publication) {

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use nalgebra::Vector3;
+use nalgebra::{Vector3, Vector6};
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 
@@ -14,13 +14,13 @@ use super::announce::Announcer;
 use super::drawing::Drawing;
 use super::health::{SharedHealth, now, processor_s};
 use super::inbox::{Arrival, Inbox};
-use super::learning::Learning;
+use super::learning::{Learning, Taught};
 use super::publications::Outputs;
 use crate::io::config::InputConfig;
 use crate::io::ingest::{Ingest, Message};
 use crate::io::model_file::SavedModel;
 use crate::math::Pose;
-use crate::pipeline::{Learned, Output, Pipeline, PipelineSettings, Planner, Snapshot};
+use crate::pipeline::{Output, Pipeline, PipelineSettings, Planner, Snapshot};
 use crate::ros::PartPrediction;
 use crate::types::{Input, Label, Stamp};
 
@@ -50,8 +50,8 @@ pub enum Command {
     /// What plans are answered from, with the transform from this frame into the fixed one, the stamp of
     /// now and the parts' centres.
     Planner(String, oneshot::Sender<Result<Box<Ground>, String>>),
-    /// A window was learned in this life of the pipeline.
-    Adopt(u64, Box<Learned>),
+    /// This was learned in this life of the pipeline.
+    Adopt(u64, Taught),
     /// The clock went back.
     BeginAgain,
     /// Parts' frames go on /tf, or not.
@@ -186,17 +186,24 @@ impl Stream {
             Command::Resume(model, reply) => {
                 let _ = reply.send(self.resume(*model));
             }
-            Command::Adopt(life, learned) if life == self.life => {
-                if let Some(pipeline) = &mut self.pipeline {
-                    pipeline.adopt(&learned);
-                    let counters = self.ingest.counters();
-                    self.announcer.learned(pipeline, &learned, counters, self.shift_ns);
-                }
-            }
+            Command::Adopt(life, taught) if life == self.life => self.adopt(taught),
             Command::Adopt(..) | Command::Stop => {}
             Command::BeginAgain => self.begin_again = true,
             Command::PublishTf(on) => self.announcer.publish_tf(on),
         }
+    }
+
+    fn adopt(&mut self, taught: Taught) {
+        let Some(pipeline) = &mut self.pipeline else { return };
+        let begin = processor_s();
+        match taught {
+            Taught::Models(models) => pipeline.adopt_models(&models),
+            Taught::Window(learned) => {
+                pipeline.adopt(&learned);
+                self.announcer.learned(pipeline, *learned, self.ingest.counters(), self.shift_ns);
+            }
+        }
+        self.health.lock().adoption.add(processor_s() - begin);
     }
 
     fn ground(&self, frame: &str) -> Result<Box<Ground>, String> {
@@ -272,7 +279,7 @@ impl Stream {
             }
         }
         let is_cloud = matches!(arrival.message, Message::Cloud(_));
-        let (begin, begin_on_processor) = (now(), is_cloud.then(processor_s).flatten());
+        let (begin, begin_on_processor) = (now(), processor_s());
         let inputs = self.ingest.push_message(&arrival.topic, arrival.message);
         let mut outputs = Vec::new();
         if let Some(pipeline) = self.pipeline.as_mut().filter(|_| self.active) {
@@ -287,10 +294,10 @@ impl Stream {
         }
         if is_cloud {
             let took_s = begin.elapsed().as_secs_f64();
-            let on_processor_s = processor_s().zip(begin_on_processor).map(|(end, begin)| end - begin);
+            let on_processor_s = processor_s() - begin_on_processor;
             let mut health = self.health.lock();
             health.tracking.add(took_s);
-            on_processor_s.into_iter().for_each(|time_s| health.processor.add(time_s));
+            health.processor.add(on_processor_s);
         }
     }
 
@@ -312,6 +319,7 @@ impl Stream {
                         covariance_m2,
                     });
                 }
+                Output::FirstLook(look) => self.learning.look(self.life, look),
                 Output::WindowClosed(window) => {
                     let (from, to) = window.span_s();
                     info!("window of {from:.1} s to {to:.1} s closed");
@@ -321,8 +329,12 @@ impl Stream {
                     }
                 }
                 Output::Observation { time_s, label, measurement } => {
-                    self.announcer.observed(label, measurement.displacement);
+                    self.announcer.observed(label, measurement.displacement, Vector6::zeros());
                     observed = Some(Stamp(zero.plus_seconds(time_s).0 - self.shift_ns));
+                }
+                // It comes after what was observed, and knows more.
+                Output::Tracked { label, displacement, twist, .. } => {
+                    self.announcer.observed(label, displacement, twist);
                 }
                 Output::Resumed { root, unexplained, unknown } => {
                     info!(%root, "goes on with a saved object");

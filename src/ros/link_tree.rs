@@ -6,7 +6,7 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::{DMatrix, Vector3};
+use nalgebra::{DMatrix, Vector3, Vector6};
 
 use crate::math::{Pose, Screw};
 use crate::structure::TreeDistribution;
@@ -196,6 +196,23 @@ impl LinkTree {
     }
 }
 
+impl LinkTree {
+    /// Rate of every joint that moves \[m/s or rad/s\], by child, from twists of the children against their
+    /// parents, (angular, linear), at the reference configuration; 0 for what is not given.
+    pub fn rates(&self, twists: &BTreeMap<Label, Vector6<f64>>) -> BTreeMap<Label, f64> {
+        let rate = |(link, _): (&Link, Vector3<f64>)| {
+            let twist = twists.get(&link.label).copied().unwrap_or_default();
+            let rate = match link.joint {
+                LinkJoint::Fixed => 0.0,
+                LinkJoint::Prismatic { direction } => direction.dot(&twist.fixed_rows::<3>(3)),
+                LinkJoint::Revolute { direction, .. } => direction.dot(&twist.fixed_rows::<3>(0)),
+            };
+            (link.label, rate)
+        };
+        self.moving().map(rate).collect()
+    }
+}
+
 /// Indices of the posterior's edges by parent's and child's node.
 fn edges_between(nodes: &[Label], posterior: &ObjectPosterior) -> DMatrix<Option<usize>> {
     let mut between = DMatrix::from_element(nodes.len(), nodes.len(), None);
@@ -300,6 +317,17 @@ mod tests {
                 assert!((found[label] - q).abs() < 1e-12, "{label}: {q} {found:?}");
             }
         }
+    }
+
+    #[test]
+    fn rates_are_along_the_joints_own_axes() {
+        let tree = LinkTree::likeliest(&door_with_drawer_and_handle());
+        // The same door, its axis the other way round.
+        let LinkJoint::Revolute { direction, point } = tree.links()[2].joint else { panic!("{tree:?}") };
+        let twists = BTreeMap::from([(Label(2), Screw::revolute(&-direction, &point).0 * 0.7)]);
+        let rates = tree.rates(&twists);
+        assert!((rates[&Label(2)] + 0.7).abs() < 1e-12, "{rates:?}");
+        assert_eq!((rates.len(), rates[&Label(3)]), (3, 0.0));
     }
 
     #[test]

@@ -9,6 +9,7 @@ mod filter;
 mod forecast;
 mod free;
 mod mechanism;
+mod mixture;
 mod plan;
 mod presence;
 mod score;
@@ -19,8 +20,9 @@ mod tests;
 
 pub use calibration::{Calibration, Kind};
 pub use filter::{Filter, Held};
-pub use forecast::{Forecast, mix};
+pub use forecast::Forecast;
 pub use free::FreePart;
+pub use mixture::{FreeAccount, JointAccount, Mixed, mixture};
 pub use mechanism::{ActiveNumber, TrackedMechanism, TreeFamily};
 pub use plan::{Plan, PlannedPose};
 pub use presence::{Account, Presence};
