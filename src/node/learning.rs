@@ -143,7 +143,7 @@ impl Learning {
                     learned(life, Taught::Models(models));
                 }
                 Work::Window(window) => {
-                    learned(life, Taught::Window(self.learn(pool, &mut worker, &window, &mut walls_s)));
+                    learned(life, Taught::Window(self.learn(pool, &mut worker, *window, &mut walls_s)));
                 }
             }
         }
@@ -153,7 +153,7 @@ impl Learning {
         &self,
         pool: &ThreadPool,
         worker: &mut Worker,
-        window: &ClosedWindow,
+        window: ClosedWindow,
         walls_s: &mut Vec<f64>,
     ) -> Box<Learned> {
         let begin = now();

@@ -16,12 +16,13 @@ use super::health::{SharedHealth, now, processor_s};
 use super::inbox::{Arrival, Inbox};
 use super::learning::{Learning, Taught};
 use super::publications::Outputs;
+use super::recording::Recording;
 use crate::io::config::InputConfig;
 use crate::io::ingest::{Ingest, Message};
 use crate::io::model_file::SavedModel;
 use crate::math::Pose;
 use crate::pipeline::{Output, Pipeline, PipelineSettings, Planner, Snapshot};
-use crate::ros::PartPrediction;
+use crate::ros::{LinkTree, PartPrediction};
 use crate::types::{Input, Label, Stamp};
 
 /// How long the thread sleeps where nothing comes.
@@ -54,8 +55,8 @@ pub enum Command {
     Adopt(u64, Taught),
     /// The clock went back.
     BeginAgain,
-    /// Parts' frames go on /tf, or not.
-    PublishTf(bool),
+    /// Parts' frames go on /tf with this before their names, or not at all.
+    PublishTf(Option<String>),
     /// The end.
     Stop,
 }
@@ -72,12 +73,15 @@ pub struct Ground {
     pub fixed_frame: String,
     /// Centres of mass of the parts at the first frame \[m\].
     pub centers: BTreeMap<Label, Vector3<f64>>,
+    /// The tree of the description.
+    pub tree: Option<LinkTree>,
 }
 
 /// The state of the stream.
 pub struct Stream {
     inbox: Arc<Inbox<Command>>,
     learning: Learning,
+    recording: Option<Recording>,
     health: SharedHealth,
     ingest: Ingest,
     input: InputConfig,
@@ -104,13 +108,14 @@ impl Stream {
     pub fn new(
         inbox: Arc<Inbox<Command>>,
         learning: Learning,
-        (outputs, drawing): (Outputs, Drawing),
+        (outputs, drawing, recording): (Outputs, Drawing, Option<Recording>),
         health: SharedHealth,
         input: InputConfig,
     ) -> Self {
         Self {
             inbox,
             learning,
+            recording,
             announcer: Announcer::new(outputs, drawing, input.fixed_frame.clone()),
             health,
             ingest: Ingest::new(&input),
@@ -189,7 +194,7 @@ impl Stream {
             Command::Adopt(life, taught) if life == self.life => self.adopt(taught),
             Command::Adopt(..) | Command::Stop => {}
             Command::BeginAgain => self.begin_again = true,
-            Command::PublishTf(on) => self.announcer.publish_tf(on),
+            Command::PublishTf(prefix) => self.announcer.publish_tf(prefix),
         }
     }
 
@@ -215,8 +220,8 @@ impl Stream {
         let frame = if frame.is_empty() { &fixed_frame } else { frame };
         let world_from_frame =
             self.ingest.transforms().lookup(&fixed_frame, frame, stamp).map_err(|error| error.to_string())?;
-        let centers = self.announcer.centers();
-        Ok(Box::new(Ground { planner, world_from_frame, stamp, fixed_frame, centers }))
+        let (centers, tree) = (self.announcer.centers(), self.announcer.tree().cloned());
+        Ok(Box::new(Ground { planner, world_from_frame, stamp, fixed_frame, centers, tree }))
     }
 
     /// A pipeline that goes on from a saved model.
@@ -279,6 +284,9 @@ impl Stream {
             }
         }
         let is_cloud = matches!(arrival.message, Message::Cloud(_));
+        if let Some(recording) = &self.recording {
+            recording.accepted(&arrival.topic, &arrival.message);
+        }
         let (begin, begin_on_processor) = (now(), processor_s());
         let inputs = self.ingest.push_message(&arrival.topic, arrival.message);
         let mut outputs = Vec::new();
@@ -317,6 +325,7 @@ impl Stream {
                         displacement,
                         center_in_world,
                         covariance_m2,
+                        joint_position: None,
                     });
                 }
                 Output::FirstLook(look) => self.learning.look(self.life, look),
@@ -353,7 +362,7 @@ impl Stream {
             }
         }
         for (stamp, predictions) in predictions {
-            self.announcer.predicted(stamp, &predictions, self.arrivals.get(&stamp).copied());
+            self.announcer.predicted(stamp, predictions, self.arrivals.get(&stamp).copied());
         }
         if let (Some(stamp), Some(pipeline)) = (observed, &self.pipeline) {
             self.announcer.frame(pipeline, stamp, self.ingest.counters(), self.shift_ns);

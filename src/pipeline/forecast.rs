@@ -294,14 +294,14 @@ impl Forecaster {
             skills: self.skills.clone(),
             rest_force,
         });
+        let state = self.state(&self.told).into_iter();
+        outputs.extend(state.map(|(label, (displacement, twist))| Output::Tracked {
+            time_s: now_s,
+            label,
+            displacement,
+            twist,
+        }));
         if self.live {
-            let state = self.state(&self.told).into_iter();
-            outputs.extend(state.map(|(label, (displacement, twist))| Output::Tracked {
-                time_s: now_s,
-                label,
-                displacement,
-                twist,
-            }));
             // The last reading stands for those to come.
             outputs.extend(self.ready(|_| true));
             return outputs;

@@ -44,8 +44,9 @@ const FARTHEST_PENALTY: f64 = 40.0;
 const WELL_AGAINST_BADLY: f64 = 20.0;
 /// The least probability that a part's evidence stands on a wrong explanation.
 const LEAST_DOUBT: f64 = 1e-3;
-/// Windows whose frames are kept for measuring again: about 7 MB each.
+/// Windows whose frames are kept for measuring again, of at most so many points in all: 84 MB.
 const KEPT_FRAMES: usize = 8;
+const KEPT_POINTS: usize = 1_500_000;
 /// A part is measured again where a later fit has moved it by more than this \[m\].
 const MEASURED_AGAIN: f64 = 0.002;
 
@@ -474,8 +475,12 @@ impl Learner {
         // Frames of windows that were saved and loaded are gone.
         self.kept.resize(self.windows.len().saturating_sub(1), Arc::default());
         self.kept.push(Arc::new(job.frames.clone()));
-        if let Some(forgotten) = self.kept.len().checked_sub(KEPT_FRAMES + 1) {
-            self.kept[forgotten] = Arc::default();
+        let mut points = 0;
+        for (age, window) in self.kept.iter_mut().rev().enumerate() {
+            points += window.iter().flat_map(|frame| frame.scans.values()).map(Vec::len).sum::<usize>();
+            if age >= KEPT_FRAMES || (age > 0 && points > KEPT_POINTS) {
+                *window = Arc::default();
+            }
         }
     }
 

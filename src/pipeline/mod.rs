@@ -39,11 +39,11 @@ use crate::registration::{AlignmentSettings, Quadratic, align, truncated_cost};
 use crate::types::{Input, Label, Stamp};
 use evaluate::Scoring;
 use explain::{FEWEST_POINTS, measurement_of, travel};
-use forecast::{Forecaster, mechanism_of};
 use first_look::REFERENCE_FRAMES;
+use forecast::{Forecaster, mechanism_of};
 use poses::{POSED_RADIUS, PoseBuffer, PosedPart, RECORD_GAP};
 use saved::Resumed;
-use windows::frame_of;
+use windows::{CutWindow, frame_of};
 use worker::Begin;
 use working_frame::WorkingFrame;
 
@@ -109,7 +109,7 @@ pub enum Output {
         /// Covariance of its centre of mass, held fixed in the part \[m²\].
         covariance_m2: Matrix3<f64>,
     },
-    /// Where tracking has a part, by its joint if it has one; only if live.
+    /// Where tracking has a part, by its joint if it has one; with predictions.
     Tracked {
         /// Seconds since time zero.
         time_s: f64,
@@ -257,8 +257,8 @@ impl Pipeline {
         for stamp in self.poses.flush() {
             outputs.extend(self.push_frame(stamp, &[]));
         }
-        let job = self.cutter.as_mut().and_then(|c| c.flush(nearest_label));
-        outputs.extend(job.and_then(|job| self.close(job)));
+        let window = self.cutter.as_mut().and_then(WindowCutter::flush);
+        outputs.extend(window.and_then(|window| self.close(window)));
         outputs.extend(self.forecaster.iter_mut().flat_map(Forecaster::finish));
         outputs
     }
@@ -309,18 +309,18 @@ impl Pipeline {
         if let Some(frames) = self.newcomers.as_mut().filter(|frames| frames.len() < REFERENCE_FRAMES) {
             frames.push(frame.clone());
         }
-        let job = self.cutter.as_mut().and_then(|c| c.push_frame(frame, moving, nearest_label));
+        let window = self.cutter.as_mut().and_then(|c| c.push_frame(frame, moving));
         if self.is_open()
             && let Some(frames) = self.newcomers.take()
             && let Some(learner) = &mut self.learner
         {
             Arc::make_mut(learner).add_parts(&frames);
         }
-        if self.learner.is_none() && self.first_look.is_none() && (self.is_open() || job.is_some()) {
+        if self.learner.is_none() && self.first_look.is_none() && (self.is_open() || window.is_some()) {
             outputs.extend(self.open_reference());
         }
-        let closed = job.is_some() && !self.settings.live;
-        outputs.extend(job.and_then(|job| self.close(job)));
+        let closed = window.is_some() && !self.settings.live;
+        outputs.extend(window.and_then(|window| self.close(window)));
         if let (Some(forecaster), Some(frame)) = (&mut self.forecaster, seen) {
             if let Some(learner) = self.learner.as_deref().filter(|_| closed) {
                 forecaster.learned(learner, mechanism_of(learner), None);
@@ -336,8 +336,8 @@ impl Pipeline {
     /// Poses stayed away: the window that is open ends with the last of them.
     fn end_record(&mut self) -> Option<Output> {
         self.poses.end_record();
-        let job = self.cutter.as_mut().and_then(|cutter| cutter.end_record(nearest_label))?;
-        let output = self.close(job);
+        let window = self.cutter.as_mut().and_then(WindowCutter::end_record)?;
+        let output = self.close(window);
         if let (Some(forecaster), Some(learner), false) = (&mut self.forecaster, &self.learner, self.settings.live) {
             forecaster.learned(learner, mechanism_of(learner), None);
         }
@@ -391,7 +391,7 @@ impl Pipeline {
     }
 
     /// A window that closed is learned here, or handed out if live.
-    fn close(&mut self, job: WindowJob) -> Option<Output> {
+    fn close(&mut self, window: CutWindow) -> Option<Output> {
         if self.settings.live && self.scoring.is_none() {
             let begin = match (&self.learner, &self.first_look) {
                 (Some(learner), _) => Begin::Learner(Arc::clone(learner)),
@@ -400,9 +400,10 @@ impl Pipeline {
             };
             self.closed_windows += 1;
             self.handed_out.push_back((self.closed_windows, self.current.clone()));
-            return Some(Output::WindowClosed(Box::new(ClosedWindow::new(self.closed_windows, job, begin))));
+            return Some(Output::WindowClosed(Box::new(ClosedWindow::new(self.closed_windows, window, begin))));
         }
         let learner = self.learner.as_mut()?;
+        let job = window.job(nearest_label);
         if let Some(scoring) = &mut self.scoring {
             let learner = Arc::make_mut(learner);
             scoring.score(learner, &job);

@@ -7,8 +7,9 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::forecast::mechanism_of;
+use super::windows::CutWindow;
 use super::working_frame::hulls;
-use super::{FirstLook, Learner, WindowJob};
+use super::{FirstLook, Learner, nearest_label};
 use crate::geometry::HullProperties;
 use crate::math::Pose;
 use crate::tracking::TrackedMechanism;
@@ -29,7 +30,7 @@ pub(super) enum Begin {
 pub struct ClosedWindow {
     /// Counts the windows handed out.
     pub(super) sequence: u64,
-    job: WindowJob,
+    window: CutWindow,
     begin: Begin,
     world_from_work: Pose,
 }
@@ -41,8 +42,8 @@ impl std::fmt::Debug for ClosedWindow {
 }
 
 impl ClosedWindow {
-    pub(super) fn new(sequence: u64, job: WindowJob, begin: Begin) -> Self {
-        Self { sequence, job, begin, world_from_work: Pose::identity() }
+    pub(super) fn new(sequence: u64, window: CutWindow, begin: Begin) -> Self {
+        Self { sequence, window, begin, world_from_work: Pose::identity() }
     }
 
     pub(super) fn carried_out(self, world_from_work: &Pose) -> Self {
@@ -51,7 +52,7 @@ impl ClosedWindow {
 
     /// Seconds since time zero of its first and last frame.
     pub fn span_s(&self) -> (f64, f64) {
-        self.job.span_s()
+        self.window.span_s()
     }
 }
 
@@ -108,18 +109,19 @@ impl Worker {
     }
 
     /// Learns one window.
-    pub fn learn(&mut self, window: &ClosedWindow) -> Learned {
+    pub fn learn(&mut self, window: ClosedWindow) -> Learned {
         let learner = self.learner.get_or_insert_with(|| match &window.begin {
             Begin::Learner(learner) => Arc::clone(learner),
             Begin::FirstLook(look) => Arc::new(look.learner()),
         });
+        let span_s = window.span_s();
         // The stream goes on with the one before meanwhile.
-        Arc::make_mut(learner).learn(&window.job);
+        Arc::make_mut(learner).learn(&window.window.job(nearest_label));
         Learned {
             sequence: window.sequence,
             mechanism: mechanism_of(learner),
             learner: Arc::clone(learner),
-            span_s: window.span_s(),
+            span_s,
             posterior: learner.posterior().carried_by(&window.world_from_work),
             hulls: hulls(&learner.surfaces(), &window.world_from_work),
             ranges_seen: learner.ranges_seen(),
