@@ -153,6 +153,8 @@ fn reproduces(environment: &Path, bag: &str, moving_joints: usize) {
         for parts in era.predicted.values() {
             let displacements = parts.iter().map(|(label, p)| (*label, p.displacement)).collect();
             let off = likeliest.off_joint(&displacements);
+            let is_last = std::ptr::eq(era, eras.last().unwrap());
+            assert!(!is_last || off.is_empty(), "{bag}: {off:?} float when all is learned");
             for link in likeliest.links().iter().filter(|link| off.contains(&link.label)) {
                 // What has no joint yet is predicted freely, as nothing says how it would move.
                 assert_eq!(link.edge, None, "{bag}: part {} is predicted off its joint", link.label);
@@ -187,7 +189,8 @@ fn reproduces(environment: &Path, bag: &str, moving_joints: usize) {
             }
         }
     }
-    assert!(floating * 20 < all, "{bag}: {floating} of {all} predictions are of parts that float");
+    // What moves before its joint was ever learned; the rest is most.
+    assert!(floating * 4 < all, "{bag}: {floating} of {all} predictions are of parts that float");
     assert!(travel > 0.1, "{bag}: parts moved by {travel} m at most");
 
     let era = eras.last().unwrap();

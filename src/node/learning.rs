@@ -5,6 +5,10 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
 use anyhow::Context as _;
 use rayon::{ThreadPool, ThreadPoolBuilder};
+use thread_priority::{
+    NormalThreadSchedulePolicy, RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue,
+    ThreadSchedulePolicy, set_thread_priority_and_policy, thread_native_id, thread_schedule_policy,
+};
 
 use super::health::{SharedHealth, now};
 use crate::pipeline::{ClosedWindow, FirstLook, Learned, Looked, Worker};
@@ -13,6 +17,8 @@ use crate::pipeline::{ClosedWindow, FirstLook, Learned, Looked, Worker};
 const MOST_WAITING: usize = 4;
 /// How much tracking goes before other programs and inference after them, in nice's steps.
 const NICENESS: (i32, i32) = (-10, 3);
+/// The latter, of 0 to 99.
+const NICE_PRIORITY: u8 = 40;
 
 /// What there is to learn.
 enum Work {
@@ -180,12 +186,25 @@ impl Learning {
     }
 }
 
-/// Threads begun by this one from now on go first. Few systems permit it to all: then nothing changes.
+/// Threads begun by this one from now on go first: in real time (SCHED_RR at its lowest priority, 1) where the
+/// system permits it, else by nice. Few systems permit that to all: then nothing changes. Nice alone does not
+/// do: it counts within a session only where sessions are scheduled as groups.
 pub fn go_first() {
-    let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS.0);
+    let realtime = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::RoundRobin);
+    if set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Min, realtime).is_err() {
+        let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS.0);
+    }
 }
 
 /// Lets the stream go first.
 pub fn give_way() {
+    if let (Ok(ThreadSchedulePolicy::Realtime(_)), Ok(priority)) =
+        (thread_schedule_policy(), ThreadPriorityValue::try_from(NICE_PRIORITY))
+    {
+        let normal = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Other);
+        let priority = ThreadPriority::Crossplatform(priority);
+        // It may always be given up.
+        let _ = set_thread_priority_and_policy(thread_native_id(), priority, normal);
+    }
     let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS.1);
 }

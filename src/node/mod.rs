@@ -65,7 +65,9 @@ pub fn run(arguments: &RosArguments, record: Option<&Path>) -> anyhow::Result<()
     let names = Names::new(NAME, arguments)?;
     let mut parameters = Parameters::declared();
     let unusable = parameters.start_with(&arguments.overrides, &names);
-    learning::go_first();
+    if parameters.is("realtime") {
+        learning::go_first();
+    }
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().context("tokio")?;
     runtime.block_on(live(&names, parameters, unusable, (!arguments.rosout_disabled, record)))

@@ -163,6 +163,13 @@ impl Parameters {
                 "Folder, an absolute path, that the meshes of ~/robot_description are written to; empty: parts are boxes.",
             ),
             (
+                "realtime",
+                Value::Bool(true),
+                None,
+                Change::AtStart,
+                "Whether tracking goes before other programs, in real time where the system permits it.",
+            ),
+            (
                 "worker_threads",
                 Value::Integer(0),
                 Some((0.0, 1024.0)),
@@ -394,7 +401,7 @@ fn checked(name: &str, declaration: &Declaration, value: &Value) -> Result<Value
 fn is_of_config(name: &str) -> bool {
     let live = ["root_label", "use_sim_time", "autostart", "publish_tf", "slowest_clouds_hz", "wrench_timeout_s"];
     !live.contains(&name)
-        && !["worker_threads", "mesh_folder", "tf_prefix"].contains(&name)
+        && !["worker_threads", "mesh_folder", "tf_prefix", "realtime"].contains(&name)
         && !name.starts_with("qos_overrides.")
         && !name.starts_with("input.wrenches.")
 }

@@ -137,10 +137,11 @@ impl Filter {
             covariance[(i, i)] += NUMBER_DEVIATION.0.powi(2);
         }
         let workspace = Workspace::new(&mechanism.tree);
+        let corrected_rates = rates.iter().map(|rate| rate.abs()).collect();
         let state = State::new(positions, rates);
         Self {
             explored: mechanism.explored.clone(),
-            corrected_rates: rates.iter().map(|rate| rate.abs()).collect(),
+            corrected_rates,
             distrusted: vec![false; n],
             disturbance: vec![0.0; n],
             numbers: mechanism.numbers.clone(),

@@ -306,6 +306,7 @@ def play(bag, settle="180"):
     """A whole bag: what was learned of it, to the last digit."""
     node = Peer()
     ready(node)
+    node.hear("/tf", TFMessage, quality(depth=100))
     player = Player(node, bag)
     node.wait(lambda: node.count_subscribers("/parts/points") > 0, 10.0)
     node.spin(1.0)
