@@ -8,7 +8,7 @@ mod window;
 pub use dynamics::{
     AddedEffect, AddedTable, BatchFit, BatchWindow, BatchedWindow, DAMPING, DeclaredPhysics, DynamicsInput,
     DynamicsLearner, DynamicsPosterior, FRICTION, Hypothesis, INERTIA, JointDynamics, JointModel, JointScales,
-    LIMIT_DEVIATION, LOWER, Mechanism, PartDynamics, SENSOR_SIZE, SIZE, SamplingReport, SensorModel, UPPER,
+    LIMIT_DEVIATION, LOWER, Mechanism, PartDynamics, SENSOR_SIZE, SIZE, SamplingReport, SensorError, SensorModel, UPPER,
     WindowInference, WindowModel, WindowResidual,
 };
 pub use edges::{

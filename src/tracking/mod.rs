@@ -11,7 +11,6 @@ mod free;
 mod mechanism;
 mod plan;
 mod presence;
-mod score;
 mod simulation;
 mod skill;
 #[cfg(test)]
@@ -24,5 +23,4 @@ pub use free::FreePart;
 pub use mechanism::{ActiveNumber, TrackedMechanism, TreeFamily};
 pub use plan::{Plan, PlannedPose};
 pub use presence::{Account, Presence};
-pub use score::{MeasuredPath, ResidualSum};
 pub use skill::Skill;

@@ -99,6 +99,7 @@ const CHUNK: usize = 6;
 const DIFFERENCE: f64 = 1e-6;
 
 /// What a simulation needs of the parameters.
+#[derive(Clone)]
 pub(super) struct Plant<T: Real> {
     pub(super) tree: Tree<T>,
     sensor: SensorError<T>,
