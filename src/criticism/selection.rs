@@ -523,6 +523,7 @@ impl Selector<'_> {
         if let Addition::Effect(joint, kind @ EffectKind::AsymmetricFriction) = addition
             && let Some(effect) = hypothesis.mechanism.joints[joint].effects.last()
             && !numbers.joints.is_empty()
+            && !start.is_empty()
         {
             start = start_by_direction(&numbers.joints[joint], &start, kind, &effect.scales);
         }

@@ -21,7 +21,7 @@ use crate::types::{Label, Stamp};
 const GATE: f64 = 0.02;
 
 /// Squares of one part's residuals under one model, summed over windows in which it moved.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct PartScore {
     /// Windows in which it moved.
     pub windows: usize,
@@ -33,6 +33,21 @@ pub struct PartScore {
     pub force: (f64, f64),
     /// Squared joint positions \[m² or rad²\], and how many.
     pub position: (f64, usize),
+    /// The residual force by time, position and rate.
+    pub residuals: Vec<ResidualSample>,
+}
+
+/// A residual force at a moment.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ResidualSample {
+    /// Since time zero \[s\].
+    pub time_s: f64,
+    /// Joint position \[m or rad\].
+    pub position: f64,
+    /// Joint rate \[m/s or rad/s\].
+    pub rate: f64,
+    /// What the model lacks \[N or N·m\].
+    pub force: f64,
 }
 
 /// The scores of one model.
@@ -83,13 +98,20 @@ impl Scoring {
     pub(super) fn score(&mut self, learner: &mut Learner, job: &WindowJob) {
         self.scores.windows += 1;
         let models = self.models.get_or_insert_with(|| learner.stages(job.zero));
-        let Some(window) = learner.unlearned_window(job) else { return };
-        self.scores.stages.resize_with(models.len(), StageScore::default);
-        for (model, stage) in models.iter().zip(&mut self.scores.stages) {
+        if let Some(window) = learner.unlearned_window(job) {
+            self.scores.add(models, &window, learner, self.horizon_s);
+        }
+    }
+}
+
+impl Scores {
+    fn add(&mut self, models: &[Stage], window: &BatchWindow, learner: &Learner, horizon_s: f64) {
+        self.stages.resize_with(models.len(), StageScore::default);
+        for (model, stage) in models.iter().zip(&mut self.stages) {
             stage.effects.clone_from(&model.effects);
-            let residual = model.hypothesis.window(&window, model.noise_scale).residual(&model.x, self.horizon_s);
+            let residual = model.hypothesis.window(window, model.noise_scale).residual(&model.x, horizon_s);
             match residual {
-                Ok(residual) => stage.add(&residual, &window, learner),
+                Ok(residual) => stage.add(&residual, window, learner),
                 Err(failure) => tracing::warn!(%failure, effects = ?model.effects, "a window is not scored"),
             }
         }
@@ -104,9 +126,12 @@ impl StageScore {
             part.windows += 1;
             part.turns = joint.joint_type == JointType::Revolute;
             part.radius_m = joint.radius;
-            for (_, length_s, force) in &residual.forces {
-                part.force.0 += length_s * force[column].powi(2);
+            for ((time_s, length_s, force), (position, rate)) in residual.forces.iter().zip(&residual.states) {
+                let force = force[column];
+                part.force.0 += length_s * force.powi(2);
                 part.force.1 += length_s;
+                let (position, rate) = (position[column], rate[column]);
+                part.residuals.push(ResidualSample { time_s: *time_s, position, rate, force });
             }
             part.position.0 += residual.squares[column].0;
             part.position.1 += residual.squares[column].1;
@@ -115,12 +140,28 @@ impl StageScore {
 }
 
 impl Learner {
+    /// Scores the models on criticism's way on the windows that they were fitted to. `zero`: what times
+    /// count from.
+    pub fn fitted_scores(&self, zero: Stamp, horizon_s: f64) -> Scores {
+        let mut scores = Scores { windows: self.windows.len(), stages: Vec::new() };
+        let Some(fit) = &self.fit else { return scores };
+        let models = self.stages(zero);
+        let windows: Vec<&WindowObservations> = self.windows.iter().collect();
+        for window in self.dynamics.batch(fit, &self.input(&windows, zero), usize::MAX) {
+            scores.add(&models, &window, self, horizon_s);
+        }
+        scores
+    }
+
+    fn input<'a>(&'a self, windows: &'a [&'a WindowObservations], zero: Stamp) -> DynamicsInput<'a> {
+        DynamicsInput { windows, contacts: &[], zero, parts: &self.hulls, use_tool: self.use_tool }
+    }
+
     /// The models on criticism's way; none where nothing could be fitted. `zero`: what times count from.
     fn stages(&self, zero: Stamp) -> Vec<Stage> {
         let Some(fit) = &self.fit else { return Vec::new() };
         let windows: Vec<&WindowObservations> = self.windows.iter().collect();
-        let input =
-            DynamicsInput { windows: &windows, contacts: &[], zero, parts: &self.hulls, use_tool: self.use_tool };
+        let input = self.input(&windows, zero);
         self.critic.stages(&self.dynamics, fit, &input).unwrap_or_else(|failure| {
             tracing::warn!(%failure, "the saved model cannot be fitted to its windows");
             Vec::new()

@@ -21,7 +21,7 @@ use std::sync::Arc;
 
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
-pub use evaluate::{PartScore, Scores, StageScore};
+pub use evaluate::{PartScore, ResidualSample, Scores, StageScore};
 pub use explain::Frame;
 pub use learner::{Learner, ParentEvidence, WindowJob};
 pub use planning::Planner;

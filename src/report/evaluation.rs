@@ -159,13 +159,13 @@ mod tests {
     #[test]
     fn a_part_is_a_line_and_every_model_with_effects_another() {
         let slide = PartScore { windows: 2, force: (0.5, 2.0), position: (4e-6, 4), ..PartScore::default() };
-        let hinge = PartScore { turns: true, radius_m: 0.5, ..slide };
+        let hinge = PartScore { turns: true, radius_m: 0.5, ..slide.clone() };
         let stage = |effects: &[(Option<Label>, &'static str)], parts: [PartScore; 2]| StageScore {
             effects: effects.to_vec(),
             parts: [Label(1), Label(5)].into_iter().zip(parts).collect(),
         };
-        let less = PartScore { force: (0.02, 2.0), ..slide };
-        let stages = vec![stage(&[], [slide, hinge]), stage(&[(Some(Label(1)), "spring")], [less, hinge])];
+        let less = PartScore { force: (0.02, 2.0), ..slide.clone() };
+        let stages = vec![stage(&[], [slide, hinge.clone()]), stage(&[(Some(Label(1)), "spring")], [less, hinge])];
         let scores = Scores { windows: 3, stages };
         let evaluation = Evaluation::new("m.json", "a.mcap", true, 1.0, &scores, Counters::default());
         let expected = "a.mcap: 3 windows, scored by m.json over 1 s, nothing learned
