@@ -30,6 +30,7 @@ fn main() -> anyhow::Result<()> {
         for study in studies(&measured, root, scratch.path())? {
             eprintln!("{}", study.name);
             section(&mut text, &study.run()?, &docs)?;
+            fs::write(docs.join("criticism.md"), &text)?;
         }
     } else {
         text.push_str("\nSKIPPED: the records are not beside the repository.\n");
@@ -44,6 +45,7 @@ fn main() -> anyhow::Result<()> {
         if bag.is_dir() {
             eprintln!("undeclared_{name}");
             bag_section(&mut text, name, &bag, &docs)?;
+            fs::write(docs.join("criticism.md"), &text)?;
         } else {
             let _ = writeln!(text, "\nSKIPPED: undeclared_{name} is not beside the repository.");
         }

@@ -43,8 +43,7 @@ impl Study {
 
     fn learn(&self, bag: &str, more: &[&str]) -> PosteriorDocument {
         let (bag, model, posterior) = (self.path(bag), self.path("model.json"), self.path("posterior.json"));
-        let arguments =
-            ["replay", &bag, "--config", &self.config, "--save-model", &model, "--posterior", &posterior];
+        let arguments = ["replay", &bag, "--config", &self.config, "--save-model", &model, "--posterior", &posterior];
         done(&[&arguments, more].concat());
         serde_json::from_str(&fs::read_to_string(posterior).unwrap()).unwrap()
     }

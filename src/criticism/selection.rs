@@ -34,17 +34,17 @@ const KNOWN: f64 = 1e9;
 const DELAYS: [f64; 4] = [-0.8, 0.3, 1.0, 2.0];
 /// A review ends at this many linearizations of a window beyond the base model's; one in which several
 /// joints move counts for the square of their number and as much again.
-const BUDGET: usize = 2500;
+const BUDGET: usize = 1500;
 /// The same where several joints move.
-const CHAIN_BUDGET: usize = 4000;
+const CHAIN_BUDGET: usize = 2500;
 /// Linearizations of a refit, and how often κ is chosen anew.
 const REFIT: (usize, usize) = (8, 2);
 /// Where several joints move, candidates are first fitted as little as this, and the best few refitted.
 const GLANCE: (usize, usize) = (4, 1);
 /// A window that needs this much process noise is far from explained: what is lacking shows little at first
 /// order, and is sought from far away. So it is with innovations this much too large or too much alike.
-const FAR: f64 = 1e3;
-const FAR_REDUCTION: f64 = 3.0;
+const FAR: f64 = 1e4;
+const FAR_REDUCTION: f64 = 10.0;
 /// κ to come from, then.
 const WIDEST: f64 = 1e5;
 /// What is tried in any case, then: the forces that change most of a motion.
@@ -133,6 +133,8 @@ struct Trial {
     /// All of its model.
     additions: BTreeSet<Addition>,
     gain: f64,
+    /// Linearizations spent, those from other starts too.
+    spent: usize,
     hypothesis: Hypothesis,
     fits: Vec<(Vec<usize>, BatchFit)>,
 }
@@ -145,10 +147,6 @@ impl Selector<'_> {
             several => 2 * several * several,
         };
         windows.iter().map(one).sum()
-    }
-
-    fn cost(&self, trial: &Trial) -> usize {
-        trial.fits.iter().map(|(windows, fitted)| fitted.steps * self.weight(windows)).sum()
     }
 
     fn windows(&self, places: &[usize]) -> Vec<&BatchWindow> {
@@ -226,8 +224,10 @@ impl Selector<'_> {
                     }
                     let (low, high) = self.workshop.range(joint);
                     let start = vec![if upper { high } else { low }];
-                    if let Ok(trial) = self.trial(&current, &Ranked { addition: stop, gain: 0.0, start, also: Vec::new() }, (5, 1)) {
-                        current.steps += self.cost(&trial);
+                    if let Ok(trial) =
+                        self.trial(&current, &Ranked { addition: stop, gain: 0.0, start, also: Vec::new() }, (5, 1))
+                    {
+                        current.steps += trial.spent;
                         if trial.gain > STOP_GAIN {
                             self.take(&mut current, &trial);
                         }
@@ -253,7 +253,7 @@ impl Selector<'_> {
                     break;
                 }
                 if let Ok(trial) = self.best_trial(&current, &candidate) {
-                    current.steps += self.cost(&trial);
+                    current.steps += trial.spent;
                     tracing::debug!(addition = ?trial.addition, first_order = candidate.gain, gain = trial.gain, "trial");
                     trials.push(trial);
                 }
@@ -347,22 +347,25 @@ impl Selector<'_> {
         };
         let mut bland = current.clone();
         bland.numbers.joints.clear();
+        // A delay's numbers are far from linear; all else is either near what is known or not.
+        let both = candidate.addition == Addition::Delay;
         let mut best: Option<Trial> = None;
-        for from in [current, &bland] {
-            for start in &starts {
+        let mut spent = 0;
+        for (from, near) in [(current, true), (&bland, false)] {
+            for (_, start) in starts.iter().enumerate().filter(|(i, _)| both || near == (*i == 0)) {
                 let start = Ranked { start: start.clone(), ..candidate.clone() };
-                if let Ok(trial) = self.trial(from, &start, GLANCE)
-                    && best.as_ref().is_none_or(|other| trial.gain > other.gain)
-                {
+                let Ok(trial) = self.trial(from, &start, GLANCE) else { continue };
+                spent += trial.spent;
+                if best.as_ref().is_none_or(|other| trial.gain > other.gain) {
                     best = Some(trial);
                 }
             }
         }
         let mut best = best.ok_or(Failure::Diverged)?;
         if !self.several() {
-            self.refine(&mut best)?;
+            spent += self.refine(&mut best)?;
         }
-        Ok(best)
+        Ok(Trial { spent, ..best })
     }
 
     /// Whether a window that moves a joint, or any for the sensor, is far from explained.
@@ -475,9 +478,11 @@ impl Selector<'_> {
 
     /// The best few of every joint, and the sensor's.
     fn shortlist(&self, current: &Selection, ranked: &[Ranked]) -> Vec<Ranked> {
-        let mut by_place: BTreeMap<Option<usize>, Vec<&Ranked>> = BTreeMap::new();
+        let mut by_place: BTreeMap<(bool, Option<usize>), Vec<&Ranked>> = BTreeMap::new();
         for candidate in ranked {
-            by_place.entry(candidate.addition.joint()).or_default().push(candidate);
+            // The sensor's last: they cost most.
+            let joint = candidate.addition.joint();
+            by_place.entry((joint.is_none(), joint)).or_default().push(candidate);
         }
         let mut shortlist: Vec<Ranked> = Vec::new();
         for mut candidates in by_place.into_values() {
@@ -497,7 +502,8 @@ impl Selector<'_> {
             if worth.iter().any(by_direction) && !worth.iter().any(offset) {
                 worth.extend(candidates.iter().find(|c| offset(c)).map(|c| (*c).clone()));
             }
-            let far = candidates.first().and_then(|c| c.addition.joint()).is_some_and(|j| self.is_far(current, Some(j)));
+            let far =
+                candidates.first().and_then(|c| c.addition.joint()).is_some_and(|j| self.is_far(current, Some(j)));
             for kind in PLAIN.iter().filter(|_| far) {
                 let own = |c: &Ranked| matches!(c.addition, Addition::Effect(_, own) if own == *kind);
                 if !worth.iter().any(own) {
@@ -550,12 +556,12 @@ impl Selector<'_> {
             })
         };
         let far = effort == GLANCE && self.is_far(current, addition.joint());
-        let scales: Vec<f64> =
-            places.iter().map(|w| if far { WIDEST } else { scale(w).unwrap_or(10.0) }).collect();
+        let scales: Vec<f64> = places.iter().map(|w| if far { WIDEST } else { scale(w).unwrap_or(10.0) }).collect();
         let fitted = hypothesis.fit(&self.windows(&places), &x, &scales, effort)?;
         let rest = self.sensor_evidence(&additions) - self.sensor_evidence(&current.additions);
         let gain = fitted.log_evidence - before + rest;
-        Ok(Trial { addition, also: candidate.also.clone(), additions, gain, hypothesis, fits: vec![(places, fitted)] })
+        let (also, spent) = (candidate.also.clone(), fitted.steps * self.weight(&places));
+        Ok(Trial { addition, also, additions, gain, spent, hypothesis, fits: vec![(places, fitted)] })
     }
 
     /// The stop at the closed end, if the effect pulls there or holds, and the joint was there.
@@ -630,7 +636,8 @@ impl Selector<'_> {
         {
             let mut fewer = current.additions.clone();
             fewer.remove(&addition);
-            if let (Addition::Friction(joint), Addition::Effect(other, EffectKind::AsymmetricFriction)) = (addition, newest)
+            if let (Addition::Friction(joint), Addition::Effect(other, EffectKind::AsymmetricFriction)) =
+                (addition, newest)
                 && joint == other
             {
                 // It stands in its place: nothing depends on it any more.
@@ -701,7 +708,7 @@ impl Selector<'_> {
             *count += 1;
             let trial = self.trial(&current, &Ranked { addition, gain, start: Vec::new(), also: Vec::new() }, REFIT);
             let Ok(trial) = trial else { continue };
-            current.steps += self.cost(&trial);
+            current.steps += trial.spent;
             tracing::debug!(?addition, gain, refitted = trial.gain, "table");
             if trial.gain > LEAST_TABLE_GAIN && best.get(&joint).is_none_or(|(other, _)| trial.gain > *other) {
                 best.insert(joint, (trial.gain, trial));

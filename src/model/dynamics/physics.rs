@@ -17,10 +17,15 @@ use crate::types::Label;
 
 impl DynamicsLearner {
     /// The windows in which joints move, in joint space; of those that move the same joints the last `most`.
+    /// Where several move, only with measured poses: hypotheses of an arm seen by clouds cost seconds a
+    /// window.
     pub fn batch(&self, fit: &KinematicFit, input: &DynamicsInput<'_>, most: usize) -> Vec<BatchWindow> {
         let mut batch: Vec<BatchWindow> = Vec::new();
         for index in (0..input.windows.len().min(self.windows.len())).rev() {
             let Some(window) = self.batch_window(index, fit, input) else { continue };
+            if window.moving.len() > 1 && input.windows[index].direct.is_empty() {
+                continue;
+            }
             if batch.iter().filter(|w| w.moving == window.moving).count() < most {
                 batch.push(window);
             }
@@ -51,8 +56,14 @@ impl DynamicsLearner {
         let mut track = joint_track(&self.source(index, &moving, fit, input), &kinematics)?;
         drop_spikes(&mut track);
         let involved = self.involved(fit, &moving);
-        (track.observations.len() >= 3)
-            .then_some(BatchWindow { index, axes: kinematics.axes, frozen, moving, involved, track })
+        (track.observations.len() >= 3).then_some(BatchWindow {
+            index,
+            axes: kinematics.axes,
+            frozen,
+            moving,
+            involved,
+            track,
+        })
     }
 
     /// The joints with what was declared of them and nothing else.

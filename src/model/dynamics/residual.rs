@@ -78,7 +78,7 @@ impl WindowModel<'_> {
                 }
                 state = self.advance(&plant, &state, [observations[k - 1].time_s, observations[k].time_s])?;
                 for (i, (sum, count)) in squares.iter_mut().enumerate() {
-                    *sum += (state[i] - smoothed[k][i]).powi(2);
+                    *sum += (state[i] - self.track.positions[k][i]).powi(2);
                     *count += 1;
                 }
             }
