@@ -242,7 +242,9 @@ def live(bag, settle="60", model="/tmp/model.json"):
     late = Peer("late")
     late.hear(f"{NODE}/object_posterior", ObjectPosterior, quality(latched=True, depth=1))
     late.hear(f"{NODE}/robot_description", String, quality(latched=True, depth=1))
-    late.wait(lambda: late.last("object_posterior") and late.last("robot_description"), 10.0)
+    # Of a writer's history the newest may come last.
+    newest = lambda: late.last("object_posterior") and late.last("object_posterior").windows_learned == windows()
+    late.wait(lambda: newest() and late.last("robot_description"), 10.0)
     posterior = node.last("object_posterior")
     predicted = node.last("predicted_poses")
     # What removes all before has no namespace, and whoever joins later does not hear it.
