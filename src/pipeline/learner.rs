@@ -48,8 +48,9 @@ const LEAST_DOUBT: f64 = 1e-3;
 const REBUILT: f64 = 0.0003;
 /// Hypotheses this far behind are not sought from new starts \[nats\].
 const HOPELESS: f64 = 100.0;
-/// Windows whose frames are kept for measuring again: about 7 MB each.
+/// Windows whose frames are kept for measuring again, of at most so many points in all: 84 MB.
 const KEPT_FRAMES: usize = 8;
+const KEPT_POINTS: usize = 1_500_000;
 /// Frames in which a part is measured in a window that it rests through: they share their error.
 const RESTING_FRAMES: usize = 20;
 /// A part is measured again where a later fit has moved it by more than this \[m\].
@@ -487,8 +488,12 @@ impl Learner {
         // Frames of windows that were saved and loaded are gone.
         self.kept.resize(self.windows.len().saturating_sub(1), Arc::default());
         self.kept.push(Arc::new(job.frames.clone()));
-        if let Some(forgotten) = self.kept.len().checked_sub(KEPT_FRAMES + 1) {
-            self.kept[forgotten] = Arc::default();
+        let mut points = 0;
+        for (age, window) in self.kept.iter_mut().rev().enumerate() {
+            points += window.iter().flat_map(|frame| frame.scans.values()).map(Vec::len).sum::<usize>();
+            if age >= KEPT_FRAMES || (age > 0 && points > KEPT_POINTS) {
+                *window = Arc::default();
+            }
         }
     }
 

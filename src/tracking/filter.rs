@@ -104,6 +104,8 @@ pub struct Filter {
     pub(super) distrusted: Vec<bool>,
     /// Least and greatest position of each joint so far.
     pub(super) explored: Vec<[f64; 2]>,
+    /// Rate of each joint when clouds or the tool last corrected it: what nothing drives goes no faster.
+    corrected_rates: Vec<f64>,
     cursor: usize,
 }
 
@@ -140,9 +142,11 @@ impl Filter {
             covariance[(i, i)] += NUMBER_DEVIATION.0.powi(2);
         }
         let workspace = Workspace::new(&mechanism.tree);
+        let corrected_rates = rates.iter().map(|rate| rate.abs()).collect();
         let state = State::new(positions, rates);
         Self {
             explored: mechanism.explored.clone(),
+            corrected_rates,
             distrusted: vec![false; n],
             disturbance: vec![0.0; n],
             numbers: mechanism.numbers.clone(),
@@ -214,6 +218,16 @@ impl Filter {
             .collect()
     }
 
+    /// The rate of a body's joint at which its centre of mass would go at a velocity in world \[m/s\], as far
+    /// as it can.
+    pub fn rate_of(&self, body: usize, velocity: &Vector3<f64>) -> f64 {
+        let tree = &self.mechanism.tree;
+        let center = tree.displacements(&self.state.positions)[body].transform_point(&self.mechanism.centers[body]);
+        let Spatial { angular, linear } = tree.screws(&self.state.positions)[body];
+        let slope = angular.cross(&center) + linear;
+        slope.dot(velocity) / slope.norm_squared().max(1e-6)
+    }
+
     /// Positions of a body's joint all through where it was seen and somewhat beyond, with the body's
     /// displacement there.
     pub fn places_along(&self, body: usize) -> Vec<(f64, Pose)> {
@@ -230,20 +244,23 @@ impl Filter {
             .collect()
     }
 
-    /// Puts a body's joint at a position where it was found, at rest; what holds it must take hold anew.
-    pub fn place(&mut self, body: usize, position: f64) {
+    /// Puts a body's joint at a position where it was found, with the rate that it was found to have; what
+    /// holds it must take hold anew.
+    pub fn place(&mut self, body: usize, position: f64, rate: f64) {
         let n = self.mechanism.joints.len();
         if self.held.is_some_and(|held| self.mechanism.chain(held.body).contains(&body)) {
             self.release();
         }
         self.state.positions[body] = position;
-        self.state.rates[body] = 0.0;
+        self.state.rates[body] = rate;
+        self.corrected_rates[body] = rate.abs();
         self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
         for at in [body, n + body] {
             self.covariance.row_mut(at).fill(0.0);
             self.covariance.column_mut(at).fill(0.0);
         }
         self.covariance[(body, body)] = (SEARCH_STEP / self.mechanism.reach(body)).powi(2);
+        self.covariance[(n + body, n + body)] = (0.5 * rate).powi(2);
     }
 
     /// What moves a body is not as the mechanism says: it stops, and is not forecast.
@@ -625,13 +642,17 @@ impl Filter {
         let inverse = DMatrix::from_column_slice(6, 6, inverse.as_slice());
         let before = self.state.rates.clone();
         self.correct(&jacobian, &inverse, &DVector::from_column_slice(innovation.as_slice()));
-        // What nothing drives does not speed up because a scan was matched elsewhere.
+        // What nothing drives does not speed up because a scan was matched elsewhere; but it may coast
+        // further than the model's friction lets it.
         let driven = self.held.map(|held| self.mechanism.chain(held.body)).unwrap_or_default();
         for joint in (0..n).filter(|joint| !driven.contains(joint)) {
-            let most = before[joint].abs();
+            let most = self.corrected_rates[joint].max(before[joint].abs());
             self.state.rates[joint] = self.state.rates[joint].clamp(-most, most);
         }
         self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
+        for joint in 0..n {
+            self.corrected_rates[joint] = self.state.rates[joint].abs();
+        }
     }
 
     /// x ← x + K z, K = P Hᵀ S⁻¹; where the numbers are only considered their rows of K are zero
