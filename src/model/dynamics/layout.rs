@@ -4,7 +4,8 @@
 //! "Modeling, Identification and Control of Robots", 2002, chapter 9): a body's inertia about its
 //! own joint, and where gravity or an ancestor shows them its mass and its centre of mass across the
 //! axis. The first moment itself would be linear in the equations, but its prior is not Gaussian:
-//! a mass within a factor of three times a centre within a few centimetres.
+//! a mass within a factor of three times a centre within a few centimetres. In logs their product is a
+//! sum: what gravity shows of a hinge is one straight line for all windows.
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
@@ -28,7 +29,7 @@ pub const LOWER: usize = 3;
 pub const UPPER: usize = 4;
 /// ln mass \[kg\] of a body on a hinge.
 pub const MASS: usize = 5;
-/// First of two components of the centre of mass across the axis \[m\]: from the axis of a hinge,
+/// First of two numbers of the centre of mass across the axis, see [`CenterFrame`]: from the axis of a hinge,
 /// from the hull's centre on a slide.
 pub const CENTER: usize = 6;
 /// Numbers of a joint without effects; those of its effects follow.
@@ -38,8 +39,11 @@ pub const SIZE: usize = 8;
 /// measured 97 for hollow drawers and 300 for doors (DESIGN.md section 9).
 const DENSITY: f64 = 200.0;
 const LOG_DENSITY_DEVIATION: f64 = 1.2;
-/// Standard deviation of ln(inertia / mass): shapes are better known than densities.
-const LOG_SHAPE_DEVIATION: f64 = 0.35;
+/// Standard deviation of ln(inertia / mass) where the centre of mass is known: shapes are better known than
+/// densities. On 23 hinges of this project's generator .07, without the centre .15; furniture is less even.
+const LOG_SHAPE_DEVIATION: f64 = 0.15;
+/// A centre of mass this many standard deviations off the axis is written by its distance and angle.
+const CLEARLY_OFF: f64 = 1.5;
 /// Standard deviation of the centre of mass, in spreads of the part's points: a uniform panel's
 /// spread is .29 of its extent, so this is 15 % of the extent.
 const CENTER_DEVIATION: f64 = 0.5;
@@ -121,6 +125,57 @@ pub struct SensorError<T: Real> {
     pub delay_s: T,
 }
 
+/// How a centre of mass across an axis is written.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CenterFrame {
+    /// Two directions across the axis.
+    pub basis: [Vector3<f64>; 2],
+    /// By ln distance \[m\] from the axis and angle \[rad\] from the first direction, that of the hull's
+    /// centre; else by its components \[m\].
+    pub polar: bool,
+}
+
+impl CenterFrame {
+    /// The frame of a joint's child; `across`: the axis that its centre shows about.
+    fn new(joint: &KinematicJoint, hull: &HullProperties, across: &Vector3<f64>) -> Self {
+        let arm = hull.center - joint.axis.point;
+        let offset = arm - joint.axis.direction * joint.axis.direction.dot(&arm);
+        if let (JointType::Revolute, Some(out)) = (joint.joint_type, offset.try_normalize(1e-6))
+            && offset.norm() > CLEARLY_OFF * center_deviation(hull, &out)
+        {
+            return Self { basis: [out, joint.axis.direction.cross(&out)], polar: true };
+        }
+        let (first, second) = orthonormal_pair(across);
+        Self { basis: [first, second], polar: false }
+    }
+
+    /// From the axis, or the hull's centre, to the centre of mass \[m\].
+    fn arm<T: Real>(&self, x: &[T]) -> Vector3<T> {
+        let [first, second] = self.basis.map(|direction| direction.map(T::constant));
+        if self.polar {
+            (first * x[CENTER + 1].cos() + second * x[CENTER + 1].sin()) * x[CENTER].exp()
+        } else {
+            first * x[CENTER] + second * x[CENTER + 1]
+        }
+    }
+
+    /// Both numbers of an arm \[m\], and by how much they change per metre along either direction.
+    fn numbers(&self, arm: &Vector3<f64>) -> ([f64; 2], f64) {
+        let [along, aside] = self.basis.map(|direction| direction.dot(arm));
+        if self.polar {
+            ([0.5 * (along * along + aside * aside).ln(), aside.atan2(along)], along.hypot(aside).recip())
+        } else {
+            ([along, aside], 1.0)
+        }
+    }
+}
+
+/// Standard deviation of a centre of mass about its hull's along a direction \[m\].
+fn center_deviation(hull: &HullProperties, direction: &Vector3<f64>) -> f64 {
+    let spread = hull.spread.dot(&direction.abs()).max(0.01);
+    if hull.is_guess() { GUESS_DEVIATIONS.2 } else { CENTER_DEVIATION * spread }
+}
+
 /// All that is fixed of one joint and its body.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct JointModel {
@@ -134,8 +189,8 @@ pub struct JointModel {
     pub stops: [bool; 2],
     /// Whether its centre of mass shows: on a hinge that gravity loads, or that is carried.
     pub center_shows: bool,
-    /// The two directions of the centre of mass.
-    pub center_basis: [Vector3<f64>; 2],
+    /// How its centre of mass is written.
+    pub center: CenterFrame,
     /// Whether Coulomb friction is in the model.
     pub friction: bool,
     /// Effects beyond that, whose numbers follow.
@@ -231,12 +286,19 @@ impl JointModel {
             mean[place] = position;
             map[(place, place)] = if self.stops[i] { LIMIT_DEVIATION } else { 1.0 };
         }
-        let offset = self.hull.center - self.foot(&self.joint.axis);
-        for (i, basis) in self.center_basis.iter().enumerate() {
-            let revolute = self.joint.joint_type == JointType::Revolute;
-            mean[CENTER + i] = if revolute { offset.dot(basis) } else { 0.0 };
-            let spread = self.hull.spread.dot(&basis.abs()).max(0.01);
-            map[(CENTER + i, CENTER + i)] = guess.map_or(CENTER_DEVIATION * spread, |(_, _, center)| center);
+        let offset = match self.joint.joint_type {
+            JointType::Revolute => self.hull.center - self.foot(&self.joint.axis),
+            _ => Vector3::zeros(),
+        };
+        let (numbers, per_metre) = self.center.numbers(&offset);
+        for (i, (basis, number)) in self.center.basis.iter().zip(numbers).enumerate() {
+            let deviation = center_deviation(&self.hull, basis);
+            mean[CENTER + i] = number;
+            map[(CENTER + i, CENTER + i)] = deviation * per_metre;
+            // Inertia goes with the distance: d ln (k² + |c|²) = 2 c·dc / (k² + |c|²).
+            if self.joint.joint_type == JointType::Revolute {
+                map[(INERTIA, CENTER + i)] = 2.0 * offset.dot(basis) * deviation / self.inertia_per_mass();
+            }
         }
         let mut covariance = &map * map.transpose();
         for (i, table) in self.tables.iter().enumerate() {
@@ -253,8 +315,7 @@ impl JointModel {
     /// The body's inertial properties at the reference configuration from the joint's numbers.
     fn inertia<T: Real>(&self, x: &[T], axis: &Axis) -> (T, Vector3<T>, Matrix3<T>) {
         let shape = self.shape();
-        let arm =
-            self.center_basis[0].map(T::constant) * x[CENTER] + self.center_basis[1].map(T::constant) * x[CENTER + 1];
+        let arm = self.center.arm(x);
         match self.joint.joint_type {
             JointType::Revolute => {
                 let mass = x[MASS].exp();
@@ -412,14 +473,14 @@ pub fn joint_models(
             } else {
                 (hinge_above(k).is_some(), hinge_above(k).unwrap_or(joint.axis.direction))
             };
-            let (first, second) = orthonormal_pair(&across);
+            let hull = hull(joint);
             JointModel {
                 joint: *joint,
-                hull: hull(joint),
+                center: CenterFrame::new(joint, &hull, &across),
+                hull,
                 scales: scales[k],
                 stops: stops[k],
                 center_shows,
-                center_basis: [first, second],
                 friction: true,
                 effects: Vec::new(),
                 tables: Vec::new(),

@@ -6,7 +6,7 @@ use nalgebra::{DMatrix, DVector, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::layout::{
-    AddedEffect, AddedTable, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism, SENSOR_SIZE, SIZE,
+    AddedEffect, AddedTable, CenterFrame, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism, SENSOR_SIZE, SIZE,
     SensorModel, UPPER, joint_models,
 };
 use super::site::{FittedWindow, WindowFit, inertial_entries, load_factor};
@@ -82,7 +82,7 @@ pub(super) struct JointMemory {
     pub(super) stops: [bool; 2],
     /// Where the stops are expected, once they are believed.
     pub(super) stop_positions: [f64; 2],
-    center_basis: Option<[Vector3<f64>; 2]>,
+    center: Option<CenterFrame>,
     hull: Option<HullProperties>,
     pub(super) friction: bool,
     pub(super) effects: Vec<AddedEffect>,
@@ -244,7 +244,7 @@ impl DynamicsLearner {
                     scales: None,
                     stops: [false; 2],
                     stop_positions: [0.0; 2],
-                    center_basis: None,
+                    center: None,
                     hull,
                     friction: self.declared.friction,
                     effects: Vec::new(),
@@ -335,7 +335,7 @@ impl DynamicsLearner {
             let Some(memory) = self.joints.get_mut(&label) else {
                 continue;
             };
-            model.center_basis = *memory.center_basis.get_or_insert(model.center_basis);
+            model.center = *memory.center.get_or_insert(model.center);
             model.friction = memory.friction;
             model.effects.clone_from(&memory.effects);
             model.tables.clone_from(&memory.tables);
