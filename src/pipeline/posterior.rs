@@ -2,12 +2,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use nalgebra::{DMatrix, Matrix3, Vector3};
+use nalgebra::{DMatrix, Matrix3, Vector2, Vector3};
 
 use super::poses::POSED_RADIUS;
 use super::{Learner, ParentEvidence, Pipeline};
 use crate::geometry::{HullProperties, hull_properties};
-use crate::math::log_sum_exp;
+use crate::math::{log_sum_exp, orthonormal_pair};
 use crate::mechanism::JointType;
 use crate::model::{Axis, DynamicsPosterior, JointDynamics, KinematicFit};
 use crate::registration::PartModel;
@@ -180,7 +180,7 @@ fn edge(
         joint_type =
             JointTypeProbabilities { rigid: mixed(rigid), prismatic: mixed(prismatic), revolute: mixed(revolute) };
     }
-    let fitted = |joint_type| fitted_axis(option?, known?.learner, child, joint_type);
+    let fitted = |joint_type| fitted_axis(option?, known?, child, joint_type);
     let revolute = fitted(JointType::Revolute).map(|(axis, covariance)| RevoluteAxis {
         axis_direction: axis.direction.into(),
         axis_point_m: axis.point.into(),
@@ -236,10 +236,11 @@ fn index_in_fit(option: &ParentEvidence, fit: &KinematicFit, child: Label, joint
 /// The axis by the joint fit where the edge is in it, else by its own.
 fn fitted_axis(
     option: &ParentEvidence,
-    learner: &Learner,
+    known: Known<'_>,
     child: Label,
     joint_type: JointType,
 ) -> Option<(Axis, DMatrix<f64>)> {
+    let learner = known.learner;
     let own = option.fits[joint_type as usize].as_ref()?;
     let wide = DMatrix::from_diagonal_element(4, 4, 1.0);
     let Some(fit) = &learner.fit else { return Some((own.joint.axis, wide)) };
@@ -247,9 +248,21 @@ fn fitted_axis(
     let joint = &fit.joints[index];
     let (offset, count) = (fit.axis_offset(index), joint.axis_parameters());
     let mut covariance = fit.covariance.view((offset, offset), (count, count)).into_owned();
+    let mut axis = joint.axis;
+    let dynamics = learned_dynamics(option, known, child, joint_type);
+    if let Some((turn, spread)) = dynamics.and_then(|dynamics| dynamics.turn) {
+        axis.direction = turned(&axis.direction, &turn);
+        covariance.fixed_view_mut::<2, 2>(0, 0).copy_from(&spread);
+    }
     let doubt = learner.doubt_beyond_least(child);
     for (i, deviation) in WRONG_AXIS.into_iter().enumerate().take(count) {
         covariance[(i, i)] += doubt * deviation.powi(2);
     }
-    Some((joint.axis, covariance))
+    Some((axis, covariance))
+}
+
+/// A direction after small turns about the two directions across it \[rad\].
+fn turned(direction: &Vector3<f64>, turn: &Vector2<f64>) -> Vector3<f64> {
+    let (first, second) = orthonormal_pair(direction);
+    (direction + (first * turn.x + second * turn.y).cross(direction)).normalize()
 }

@@ -7,7 +7,7 @@
 //! a mass within a factor of three times a centre within a few centimetres. In logs their product is a
 //! sum: what gravity shows of a hinge is one straight line for all windows.
 
-use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix2, Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::HullProperties;
@@ -32,8 +32,10 @@ pub const MASS: usize = 5;
 /// First of two numbers of the centre of mass across the axis, see [`CenterFrame`]: from the axis of a hinge,
 /// from the hull's centre on a slide.
 pub const CENTER: usize = 6;
+/// First of two components of the error of the axis's direction, see [`TiltFrame`] \[rad\].
+pub const TILT: usize = 8;
 /// Numbers of a joint without effects; those of its effects follow.
-pub const SIZE: usize = 8;
+pub const SIZE: usize = 10;
 
 /// Density of a hull \[kg/m³\], and how far off it may be (standard deviation of its logarithm):
 /// measured 97 for hollow drawers and 300 for doors (DESIGN.md section 9).
@@ -44,6 +46,8 @@ const LOG_DENSITY_DEVIATION: f64 = 1.2;
 const LOG_SHAPE_DEVIATION: f64 = 0.15;
 /// A centre of mass this many standard deviations off the axis is written by its distance and angle.
 const CLEARLY_OFF: f64 = 1.5;
+/// An axis within 30° of gravity is that of a door; further than that a slide's.
+const UPRIGHT: f64 = 0.87;
 /// Standard deviation of the centre of mass, in spreads of the part's points: a uniform panel's
 /// spread is .29 of its extent, so this is 15 % of the extent.
 const CENTER_DEVIATION: f64 = 0.5;
@@ -170,6 +174,49 @@ impl CenterFrame {
     }
 }
 
+/// In which directions an axis may be off by more than gravity would let pass: what pulls along a slide
+/// that is not quite level, or turns a door that is not quite upright, is weight and no force of its own.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TiltFrame {
+    /// Two directions across the axis, on a slide the first as upright as can be.
+    pub basis: [Vector3<f64>; 2],
+    /// How many of them gravity shows.
+    pub shown: usize,
+}
+
+impl TiltFrame {
+    fn new(joint: &KinematicJoint, gravity: &Vector3<f64>) -> Self {
+        let n = joint.axis.direction;
+        let (first, second) = orthonormal_pair(&n);
+        let Some(down) = gravity.try_normalize(1e-6) else { return Self { basis: [first, second], shown: 0 } };
+        let upright = n.dot(&down).abs() > UPRIGHT;
+        match ((down - n * n.dot(&down)).try_normalize(1e-6), joint.joint_type) {
+            (_, JointType::Revolute) if upright => Self { basis: [first, second], shown: 2 },
+            (Some(steepest), JointType::Prismatic) if !upright => {
+                Self { basis: [steepest, n.cross(&steepest)], shown: 1 }
+            }
+            _ => Self { basis: [first, second], shown: 0 },
+        }
+    }
+
+    /// What the numbers add to the direction.
+    fn tilt<T: Real>(&self, x: &[T]) -> Vector3<T> {
+        let shown = self.basis.iter().enumerate().take(self.shown);
+        shown.fold(Vector3::zeros(), |sum, (i, basis)| sum + basis.map(T::constant) * x[TILT + i])
+    }
+
+    /// The numbers of a small change of the direction.
+    pub fn numbers(&self, change: &Vector3<f64>) -> [f64; 2] {
+        self.basis.map(|basis| basis.dot(change))
+    }
+
+    /// Takes the axis's own two turns \[rad\] to the numbers: a turn by a f + b s adds b f − a s.
+    pub fn from_turns(&self, axis: &Axis) -> Matrix2<f64> {
+        let (first, second) = orthonormal_pair(&axis.direction);
+        Matrix2::from_fn(|i, j| if j == 0 { -self.basis[i].dot(&second) } else { self.basis[i].dot(&first) })
+    }
+}
+
 /// Standard deviation of a centre of mass about its hull's along a direction \[m\].
 fn center_deviation(hull: &HullProperties, direction: &Vector3<f64>) -> f64 {
     let spread = hull.spread.dot(&direction.abs()).max(0.01);
@@ -191,6 +238,8 @@ pub struct JointModel {
     pub center_shows: bool,
     /// How its centre of mass is written.
     pub center: CenterFrame,
+    /// How its axis may be tilted.
+    pub tilt: TiltFrame,
     /// Whether Coulomb friction is in the model.
     pub friction: bool,
     /// Effects beyond that, whose numbers follow.
@@ -236,6 +285,7 @@ impl JointModel {
         if self.center_shows {
             active.extend([CENTER, CENTER + 1]);
         }
+        active.extend(TILT..TILT + self.tilt.shown);
         active.extend(SIZE..self.size());
         active
     }
@@ -420,10 +470,15 @@ impl Mechanism {
             let (mass, com, about_com) = model.inertia(own, &axes[k]);
             let here = frozen[k].map_or(parent, |q| parent * screw.displacement(q));
             let pose = Pose::constant(&here);
+            let tilt = model.tilt.tilt(own);
+            let turned = match model.joint.joint_type {
+                JointType::Prismatic => Screw::prismatic(&tilt),
+                _ => Screw::revolute(&tilt, &axes[k].point.map(T::constant)),
+            };
             let body = Body {
                 parent: model.joint.parent,
                 joint: if frozen[k].is_some() { JointType::Rigid } else { model.joint.joint_type },
-                screw: Screw(parent.adjoint(&screw.0).map(T::constant)),
+                screw: Screw(Pose::constant(&parent).adjoint(&(screw.0.map(T::constant) + turned.0))),
                 mass,
                 com_in_world: pose.transform_point(&com),
                 inertia_about_com: pose.rotation * about_com * pose.rotation.transpose(),
@@ -477,6 +532,7 @@ pub fn joint_models(
             JointModel {
                 joint: *joint,
                 center: CenterFrame::new(joint, &hull, &across),
+                tilt: TiltFrame::new(joint, gravity),
                 hull,
                 scales: scales[k],
                 stops: stops[k],
@@ -487,4 +543,23 @@ pub fn joint_models(
             }
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_centre_of_mass_is_what_its_numbers_say() {
+        for polar in [true, false] {
+            let frame = CenterFrame { basis: [Vector3::x(), Vector3::y()], polar };
+            let arm = Vector3::new(0.2, -0.05, 0.0);
+            let (numbers, per_metre) = frame.numbers(&arm);
+            let mut x = [0.0; SIZE];
+            x[CENTER..CENTER + 2].copy_from_slice(&numbers);
+            assert!((frame.arm(&x) - arm).norm() < 1e-12);
+            let expected = if polar { 1.0 / arm.norm() } else { 1.0 };
+            assert!((per_metre - expected).abs() < 1e-9);
+        }
+    }
 }
