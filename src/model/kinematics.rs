@@ -170,7 +170,7 @@ impl Default for KinematicSettings {
             tool_offset_sigma: 0.003,
             shared_error: 0.003,
             shared_distance: 0.010,
-            view_error: 0.0045,
+            view_error: 0.004,
             view_distance: 0.1,
             rest_deviations: 2.0,
             steps: 15,
@@ -820,6 +820,18 @@ impl<'a> Problem<'a> {
         drift
     }
 
+    /// Eᵀ, with E Eᵀ the covariance of the error that goes with a view, ξ as in [`PoseMeasurement`]: `view_error`
+    /// in every direction, and what the measurement states, as outlines err alike in all frames.
+    fn view_error(&self, information: &Matrix6<f64>, radius: f64) -> Matrix6<f64> {
+        let scale = Vector6::new(radius, radius, radius, 1.0, 1.0, 1.0);
+        let scaled = Matrix6::from_fn(|i, j| information[(i, j)] / (scale[i] * scale[j]));
+        let mut eigen = scaled.symmetric_eigen();
+        let least = self.settings.view_error.powi(2);
+        eigen.eigenvalues.apply(|x| *x = if *x > 0.0 { (least + 1.0 / *x).sqrt() } else { 0.0 });
+        let root = eigen.recompose();
+        Matrix6::from_fn(|i, j| root[(i, j)] / scale[j])
+    }
+
     /// By joint and faces: the views of its child, with the gradient in the global unknowns (columns) that one
     /// `view_error` in each of six directions causes. Looks within `shared_distance` are one view.
     fn views(&self, systems: &[WindowSystem]) -> Vec<[Vec<(Look, DMatrix<f64>)>; 2]> {
@@ -838,16 +850,17 @@ impl<'a> Problem<'a> {
                     }
                     let look = Look::at(joint, &displacements[row.joint]);
                     let views = &mut views[row.joint][row.face];
-                    let known = views.iter().position(|(other, _)| other.distance(&look) < self.settings.shared_distance);
+                    let known =
+                        views.iter().position(|(other, _)| other.distance(&look) < self.settings.shared_distance);
                     let index = known.unwrap_or(views.len());
                     if known.is_none() {
                         views.push((look, DMatrix::zeros(globals, 6)));
                     }
                     let pull = &mut views[index].1;
-                    let angle = 1.0 / joint.radius;
-                    let unit = Vector6::new(angle, angle, angle, 1.0, 1.0, 1.0) * self.settings.view_error;
+                    let Some(raw) = self.measured(w, row.joint, frame, row.face) else { continue };
+                    let error = self.view_error(&raw.information, joint.radius);
                     for (at, column) in &row.jacobian {
-                        let value = (row.information * column).component_mul(&unit).transpose();
+                        let value = (error * row.information * column).transpose();
                         match *at {
                             Slot::Global(row) => pull.row_mut(row).zip_apply(&value, |p, v| *p += v),
                             Slot::Local(row) => pull.ger(-1.0, &coupling.row(row).transpose(), &value.transpose(), 1.0),

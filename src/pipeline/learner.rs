@@ -381,6 +381,12 @@ impl Learner {
         for (label, motion) in &motions {
             self.tracks.entry(*label).or_default().push(motion.displacements.clone());
         }
+        // What was taken for the root may turn out to be none: it has a track like the others.
+        let rested = self.models.keys().filter(|label| !self.root_is_given && !motions.contains_key(label));
+        for label in rested {
+            let place = self.displacements.get(label).copied().unwrap_or_else(Pose::identity);
+            self.tracks.entry(*label).or_default().push(vec![place; job.frames.len()]);
+        }
         self.windows.push(observations);
         self.grow(job, &motions);
         let last = self.windows.len() - 1;
