@@ -358,9 +358,11 @@ impl Learner {
         let (motions, contacts) = explain_contacts(&scene, &measured, !bound);
         let direct = poses.keys().filter_map(|label| Some((*label, self.posed.get(label)?.information))).collect();
         for (label, motion) in &motions {
+            // What goes along with another part says nothing of its own joint.
+            let rides = self.rides(*label, motion, &motions);
             let explained = self.explained.entry(*label).or_default();
             match motion.explained {
-                Some(true) if motion.moved => explained.well += 1.0,
+                Some(true) if motion.moved && !rides => explained.well += 1.0,
                 Some(false) => explained.badly += 1.0,
                 _ => {}
             }
@@ -412,6 +414,16 @@ impl Learner {
         self.learn_dynamics(job, &contacts);
         self.record(job);
         self.retire();
+    }
+
+    /// Whether a part keeps its place on the one that carries it.
+    fn rides(&self, label: Label, motion: &Motion, motions: &BTreeMap<Label, Motion>) -> bool {
+        let (Some(model), Some(carrier)) = (self.models.get(&label), motion.carrier.and_then(|c| motions.get(&c)))
+        else {
+            return false;
+        };
+        let mut relative = carrier.displacements.iter().zip(&motion.displacements).map(|(c, own)| c.inverse() * *own);
+        relative.next().is_some_and(|first| relative.all(|place| travel(model, &first, &place) < RESTS))
     }
 
     fn learn_dynamics(&mut self, job: &WindowJob, contacts: &[Contact]) {
