@@ -1,8 +1,10 @@
 //! The posterior of the dynamics, as it is published.
 
-use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix2, Matrix3, Vector2, Vector3};
 
-use super::layout::{AddedTable, CENTER, DAMPING, FRICTION, INERTIA, JointModel, LOWER, MASS, SensorError, UPPER};
+use super::layout::{
+    AddedTable, CENTER, DAMPING, FRICTION, INERTIA, JointModel, LOWER, MASS, SensorError, TILT, UPPER,
+};
 use super::learner::DynamicsLearner;
 use crate::inference::Failure;
 use crate::mechanism::effects::{EffectKind, TableKind};
@@ -26,6 +28,9 @@ pub struct JointDynamics {
     pub friction: Quantity,
     /// M_jj at q = 0.
     pub joint_inertia: Quantity,
+    /// Where gravity shows how a slide lies: by how much its direction is off in the axis's own two turns
+    /// \[rad\], and their covariance.
+    pub turn: Option<(Vector2<f64>, Matrix2<f64>)>,
     /// End stops, where there are any known.
     pub lower_limit: Option<Quantity>,
     /// The upper one.
@@ -111,8 +116,14 @@ impl DynamicsLearner {
                     Ok(Quantity::from_log_normal(unit, value, deviation, InformedBy::Dynamics))
                 }
             };
+            let turn = (!revolute && model.tilt.shown > 0).then(|| {
+                let back = model.tilt.from_turns(&model.joint.axis).transpose();
+                let tilt: Vector2<f64> = posterior.mean.fixed_rows::<2>(at + TILT).into();
+                (back * tilt, back * posterior.covariance.fixed_view::<2, 2>(at + TILT, at + TILT) * back.transpose())
+            });
             posterior.joints.push(JointDynamics {
                 label: model.joint.child,
+                turn,
                 damping: resisting(units[0], DAMPING, 2)?,
                 friction: resisting(units[1], FRICTION, 0)?,
                 joint_inertia: Quantity::from_log_normal(
