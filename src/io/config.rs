@@ -165,6 +165,8 @@ impl Config {
             ("kinematics.tool_offset_sigma", self.kinematics.tool_offset_sigma),
             ("kinematics.shared_error", self.kinematics.shared_error),
             ("kinematics.shared_distance", self.kinematics.shared_distance),
+            ("kinematics.view_error", self.kinematics.view_error),
+            ("kinematics.view_distance", self.kinematics.view_distance),
             ("kinematics.rest_deviations", self.kinematics.rest_deviations),
             ("kinematics.student_freedom", self.kinematics.student_freedom),
             ("windows.kept", self.windows.kept as f64),

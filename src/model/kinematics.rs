@@ -26,11 +26,6 @@ const FACE_ERROR_SIGMA: [f64; 2] = [0.0015, 0.020];
 /// A hinged part is seen from another side once it has turned; a sliding one keeps its side: √2 times the angle \[rad\].
 const TURNED: f64 = 0.1;
 
-/// What registration errors do beyond what is modelled of them: on 17 bags of this project's generator
-/// (45 joints) errors were this many times the stated spreads at the median, for directions and for
-/// positions (of axes, and of the tool's offset, which goes with them).
-const DIRECTION_WIDENING: f64 = 1.3;
-const POSITION_WIDENING: f64 = 2.0;
 /// How closely axes follow the faces they are aligned with \[rad\].
 const ALIGNED_SIGMA: f64 = 0.007;
 /// A reference pose's rotation that was not measured may be off by any angle: it does not matter \[rad⁻²\].
@@ -157,6 +152,10 @@ pub struct KinematicSettings {
     pub shared_error: f64,
     /// Frames within this distance share their registration error \[m\].
     pub shared_distance: f64,
+    /// Registration error that goes with how a part is seen \[m\].
+    pub view_error: f64,
+    /// Over this distance views, and their errors, become others \[m\].
+    pub view_distance: f64,
     /// Joint positions closer than this many standard deviations are one rest.
     pub rest_deviations: f64,
     /// Gauss–Newton steps at most.
@@ -171,6 +170,8 @@ impl Default for KinematicSettings {
             tool_offset_sigma: 0.003,
             shared_error: 0.003,
             shared_distance: 0.010,
+            view_error: 0.004,
+            view_distance: 0.1,
             rest_deviations: 2.0,
             steps: 15,
             student_freedom: 6.0,
@@ -415,7 +416,7 @@ impl<'a> Problem<'a> {
             let (r, information) = measured.compare(information, &self.joints[j].center, predicted);
             let error = (face == 1 || turned || self.references[j].is_some()).then_some(face);
             let value = error.map_or(r, |e| r - self.face_errors[j][e]);
-            Some(Residual { error, value, information, dimensions: measured.dimensions() })
+            Some(Residual { face, error, value, information, dimensions: measured.dimensions() })
         };
         [one(0), one(1)].into_iter().flatten()
     }
@@ -501,7 +502,6 @@ impl<'a> Problem<'a> {
     fn linearize_window(&self, w: usize) -> WindowSystem {
         let window = self.windows[w];
         let globals = self.global_count();
-        let axes = self.axis_count();
         let locals = self.slot_counts[w] + 3 * window.contacts.len();
         let mut system = WindowSystem {
             local: DMatrix::identity(locals, locals) * 1e-2,
@@ -519,18 +519,8 @@ impl<'a> Problem<'a> {
         for (frame, touches) in touching.iter().enumerate() {
             let displacements = forward(&self.joints, |j| self.positions[w][j][frame]);
             let columns = self.twist_columns(w, frame, &displacements);
-            for (j, joint) in self.joints.iter().enumerate() {
-                let into_body = (Pose::from_translation(-joint.center) * displacements[j].inverse()).adjoint_matrix();
-                let twists: Vec<_> = columns[j].iter().map(|(at, v)| (*at, into_body * v)).collect();
-                for r in self.residuals(w, j, frame, &displacements[j]) {
-                    let weight = self.student_weight(r.chi_squared(), r.dimensions);
-                    let mut jacobian = twists.clone();
-                    if let Some(error) = r.error {
-                        let unit = |i: usize| -Matrix6::identity().column(i);
-                        jacobian.extend((0..6).map(|i| (Slot::Global(axes + 12 * j + 6 * error + i), unit(i))));
-                    }
-                    accumulate(&mut system, &jacobian, &(r.information * weight), &r.value);
-                }
+            for row in self.pose_rows(w, frame, &displacements, &columns) {
+                accumulate(&mut system, &row.jacobian, &row.information, &row.residual);
             }
             for (c, x, sigma) in touches {
                 let Some(&j) = self.by_label.get(&window.contacts[*c].label) else { continue };
@@ -554,6 +544,32 @@ impl<'a> Problem<'a> {
             }
         }
         system
+    }
+
+    /// What a frame's poses say, linearized at their weights.
+    fn pose_rows(
+        &self,
+        w: usize,
+        frame: usize,
+        displacements: &[Pose],
+        columns: &[Vec<(Slot, Vector6<f64>)>],
+    ) -> Vec<PoseRow> {
+        let axes = self.axis_count();
+        let mut rows = Vec::new();
+        for (j, joint) in self.joints.iter().enumerate() {
+            let into_body = (Pose::from_translation(-joint.center) * displacements[j].inverse()).adjoint_matrix();
+            for r in self.residuals(w, j, frame, &displacements[j]) {
+                let weight = self.student_weight(r.chi_squared(), r.dimensions);
+                let mut jacobian: Vec<_> = columns[j].iter().map(|(at, v)| (*at, into_body * v)).collect();
+                if let Some(error) = r.error {
+                    let unit = |i: usize| -Matrix6::identity().column(i);
+                    jacobian.extend((0..6).map(|i| (Slot::Global(axes + 12 * j + 6 * error + i), unit(i))));
+                }
+                let information = r.information * weight;
+                rows.push(PoseRow { joint: j, face: r.face, jacobian, information, residual: r.value });
+            }
+        }
+        rows
     }
 
     /// For each joint's child, the unknowns that move it and the left twists they move it by.
@@ -695,23 +711,20 @@ impl<'a> Problem<'a> {
         // What a pose topic measures shares no registration error.
         for j in (0..self.joints.len()).filter(|&j| self.references[j].is_none()) {
             // Frames that follow each other at one place count together.
-            let mut places: Vec<(Vector3<f64>, Vector3<f64>, Vec<(usize, usize)>)> = Vec::new();
+            let mut looks: Vec<(Look, Vec<(usize, usize)>)> = Vec::new();
             for (w, window) in self.windows.iter().enumerate() {
                 for frame in 0..window.times_s.len() {
                     let displacement = forward(&self.joints, |i| self.positions[w][i][frame])[j];
-                    let rotated = displacement.rotation * Vector3::repeat(self.joints[j].radius / 3f64.sqrt());
-                    let place = displacement.transform_point(&self.joints[j].center);
-                    match places.last_mut() {
-                        Some((p, r, frames)) if *p == place && *r == rotated => frames.push((w, frame)),
-                        _ => places.push((place, rotated, vec![(w, frame)])),
+                    let look = Look::at(&self.joints[j], &displacement);
+                    match looks.last_mut() {
+                        Some((last, frames)) if *last == look => frames.push((w, frame)),
+                        _ => looks.push((look, vec![(w, frame)])),
                     }
                 }
             }
-            for (place, rotated, frames) in &places {
-                let near = |(p, r, _): &&(Vector3<f64>, Vector3<f64>, Vec<(usize, usize)>)| {
-                    (p - place).norm() + (r - rotated).norm() < self.settings.shared_distance
-                };
-                let count: usize = places.iter().filter(near).map(|(_, _, frames)| frames.len()).sum();
+            for (look, frames) in &looks {
+                let near = looks.iter().filter(|(other, _)| look.distance(other) < self.settings.shared_distance);
+                let count: usize = near.map(|(_, frames)| frames.len()).sum();
                 for &(w, frame) in frames {
                     sharing[w][j][frame] = count as f64;
                 }
@@ -787,27 +800,89 @@ impl<'a> Problem<'a> {
         }
     }
 
+    /// Covariance of the gradient in the global unknowns by registration errors that go with the view: of each
+    /// part and its faces a Gaussian process over where the part is, none at the reference configuration.
+    fn drift_of_views(&self, systems: &[WindowSystem]) -> DMatrix<f64> {
+        let globals = self.global_count();
+        let mut drift = DMatrix::zeros(globals, globals);
+        for (j, views) in self.views(systems).iter().enumerate() {
+            let joint = &self.joints[j];
+            let start = Look::at(joint, &Pose::identity());
+            let likeness = |a: &Look, b: &Look| (-a.distance(b) / self.settings.view_distance).exp();
+            for views in views {
+                for (a, pull) in views {
+                    let mut total = DMatrix::zeros(globals, 6);
+                    for (b, other) in views {
+                        total += other * (likeness(a, b) - likeness(a, &start) * likeness(&start, b));
+                    }
+                    drift += pull * total.transpose();
+                }
+            }
+        }
+        drift
+    }
+
+    /// Eᵀ, with E Eᵀ the covariance of the error that goes with a view, ξ as in [`PoseMeasurement`]: `view_error`
+    /// in every direction, and what the measurement states, as outlines err alike in all frames.
+    fn view_error(&self, information: &Matrix6<f64>, radius: f64) -> Matrix6<f64> {
+        let scale = Vector6::new(radius, radius, radius, 1.0, 1.0, 1.0);
+        let scaled = Matrix6::from_fn(|i, j| information[(i, j)] / (scale[i] * scale[j]));
+        let mut eigen = scaled.symmetric_eigen();
+        let least = self.settings.view_error.powi(2);
+        eigen.eigenvalues.apply(|x| *x = if *x > 0.0 { (least + 1.0 / *x).sqrt() } else { 0.0 });
+        let root = eigen.recompose();
+        Matrix6::from_fn(|i, j| root[(i, j)] / scale[j])
+    }
+
+    /// By joint and faces: the views of its child, with the gradient in the global unknowns (columns) that one
+    /// `view_error` in each of six directions causes. Looks within `shared_distance` are one view.
+    fn views(&self, systems: &[WindowSystem]) -> Vec<[Vec<(Look, DMatrix<f64>)>; 2]> {
+        let globals = self.global_count();
+        let mut views: Vec<[Vec<(Look, DMatrix<f64>)>; 2]> = self.joints.iter().map(|_| Default::default()).collect();
+        for (w, (window, system)) in self.windows.iter().zip(systems).enumerate() {
+            let Some(local) = system.local.clone().cholesky() else { continue };
+            let coupling = local.solve(&system.coupling);
+            for frame in 0..window.times_s.len() {
+                let displacements = forward(&self.joints, |j| self.positions[w][j][frame]);
+                let columns = self.twist_columns(w, frame, &displacements);
+                for row in self.pose_rows(w, frame, &displacements, &columns) {
+                    let joint = &self.joints[row.joint];
+                    if self.references[row.joint].is_some() {
+                        continue;
+                    }
+                    let look = Look::at(joint, &displacements[row.joint]);
+                    let views = &mut views[row.joint][row.face];
+                    let known =
+                        views.iter().position(|(other, _)| other.distance(&look) < self.settings.shared_distance);
+                    let index = known.unwrap_or(views.len());
+                    if known.is_none() {
+                        views.push((look, DMatrix::zeros(globals, 6)));
+                    }
+                    let pull = &mut views[index].1;
+                    let Some(raw) = self.measured(w, row.joint, frame, row.face) else { continue };
+                    let error = self.view_error(&raw.information, joint.radius);
+                    for (at, column) in &row.jacobian {
+                        let value = (error * row.information * column).transpose();
+                        match *at {
+                            Slot::Global(row) => pull.row_mut(row).zip_apply(&value, |p, v| *p += v),
+                            Slot::Local(row) => pull.ger(-1.0, &coupling.row(row).transpose(), &value.transpose(), 1.0),
+                        }
+                    }
+                }
+            }
+        }
+        views
+    }
+
     fn finish(self, cost: f64, converged: bool) -> KinematicFit {
         let systems = self.linearize();
         let (matrix, _, _) = self.reduced(&systems, 0.0);
         let globals = matrix.nrows();
         let window_information = window_information(&matrix, &systems);
+        let drift = self.drift_of_views(&systems);
         let mut covariance = matrix.cholesky().map_or_else(|| DMatrix::identity(globals, globals), |c| c.inverse());
-        let mut widening = DVector::repeat(globals, 1.0);
-        let mut at = 0;
-        for (joint, reference) in self.joints.iter().zip(&self.references) {
-            for i in 0..joint.axis_parameters() {
-                let registration = if i < 2 { DIRECTION_WIDENING } else { POSITION_WIDENING };
-                widening[at + i] = if reference.is_some() { 1.0 } else { registration };
-            }
-            at += joint.axis_parameters();
-        }
-        widening.rows_mut(globals - 3, 3).fill(POSITION_WIDENING);
-        for i in 0..globals {
-            for j in 0..globals {
-                covariance[(i, j)] *= widening[i] * widening[j];
-            }
-        }
+        covariance += &covariance * drift * &covariance;
+        let covariance = (&covariance + covariance.transpose()) * 0.5;
         let moves = (0..self.joints.len())
             .map(|j| self.slots.iter().map(|w| w[j].windows(2).filter(|pair| pair[0] != pair[1]).count()).collect())
             .collect();
@@ -849,6 +924,35 @@ fn window_information(matrix: &DMatrix<f64>, systems: &[WindowSystem]) -> Vec<f6
         .collect()
 }
 
+/// Where a part is seen \[m\]: looks at one pose share their registration error.
+#[derive(PartialEq)]
+struct Look {
+    place: Vector3<f64>,
+    rotated: Vector3<f64>,
+}
+
+impl Look {
+    fn at(joint: &KinematicJoint, displacement: &Pose) -> Self {
+        Self {
+            place: displacement.transform_point(&joint.center),
+            rotated: displacement.rotation * Vector3::repeat(joint.radius / 3f64.sqrt()),
+        }
+    }
+
+    fn distance(&self, other: &Self) -> f64 {
+        (self.place - other.place).norm() + (self.rotated - other.rotated).norm()
+    }
+}
+
+/// A pose measurement, linearized.
+struct PoseRow {
+    joint: usize,
+    face: usize,
+    jacobian: Vec<(Slot, Vector6<f64>)>,
+    information: Matrix6<f64>,
+    residual: Vector6<f64>,
+}
+
 #[derive(Clone, Copy)]
 enum Slot {
     Local(usize),
@@ -882,6 +986,8 @@ fn accumulate<const R: usize>(
 
 /// What a fit leaves of a measurement.
 struct Residual {
+    /// Which faces were measured: those of the first look, or later ones.
+    face: usize,
     /// Which rigid error it shares, if any.
     error: Option<usize>,
     value: Vector6<f64>,
@@ -920,5 +1026,43 @@ impl Contact {
     /// The tool's position in a frame \[m\].
     pub fn position(&self, frame: usize) -> Option<Vector3<f64>> {
         self.track.iter().find(|(k, _, _)| *k == frame).map(|(_, x, _)| *x)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A drawer that is pulled out by 20 cm, seen in so many frames.
+    fn drawer(frames: usize) -> KinematicFit {
+        let joint = KinematicJoint {
+            parent: None,
+            child: Label(1),
+            joint_type: JointType::Prismatic,
+            axis: Axis { direction: Vector3::x(), point: Vector3::zeros() },
+            center: Vector3::zeros(),
+            radius: 0.2,
+            suggested: None,
+        };
+        let positions: Vec<f64> = (0..frames).map(|k| 0.2 * k as f64 / (frames - 1) as f64).collect();
+        let seen = |q: &f64| {
+            let displacement = Pose::from_translation(Vector3::x() * *q);
+            Some(PoseMeasurement { displacement, information: Matrix6::identity() * 1e6 })
+        };
+        let window = WindowObservations {
+            times_s: (0..frames).map(|k| 0.1 * k as f64).collect(),
+            poses: BTreeMap::from([(Label(1), positions.iter().map(seen).collect())]),
+            ..WindowObservations::default()
+        };
+        fit_kinematics(vec![joint], vec![vec![positions]], &[&window], &KinematicSettings::default())
+    }
+
+    #[test]
+    fn frames_do_not_average_away_what_goes_with_the_view() {
+        let spread = |frames: usize| drawer(frames).covariance[(0, 0)].sqrt();
+        let (few, many) = (spread(12), spread(120));
+        assert!(many > 0.7 * few, "{few} with 12 frames, {many} with 120");
+        // 4.5 mm over 20 cm and less, as views are forgotten on the way.
+        assert!((0.008..0.03).contains(&many), "{many}");
     }
 }

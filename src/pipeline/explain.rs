@@ -117,7 +117,7 @@ pub struct Motion {
     /// Whether it is explained: seen or felt to be there, or clearly not; `None`: in between.
     pub explained: Option<bool>,
     /// The part that it was explained against; `None`: the world.
-    carrier: Option<Label>,
+    pub carrier: Option<Label>,
     /// Excess, misses of the tool and complexity: the least is taken.
     score: f64,
 }

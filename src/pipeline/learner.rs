@@ -116,7 +116,12 @@ struct Explained {
 impl Explained {
     /// Probability that the evidence stands on a wrong explanation.
     fn doubt(&self) -> f64 {
-        (self.badly / (self.badly + WELL_AGAINST_BADLY * self.well)).clamp(LEAST_DOUBT, 1.0)
+        self.share_badly().max(LEAST_DOUBT)
+    }
+
+    /// The share of what was explained badly, a window that was explained well weighing more.
+    fn share_badly(&self) -> f64 {
+        if self.badly > 0.0 { self.badly / (self.badly + WELL_AGAINST_BADLY * self.well) } else { 0.0 }
     }
 }
 
@@ -284,6 +289,11 @@ impl Learner {
         self.explained.get(&label).copied().unwrap_or_default().doubt()
     }
 
+    /// The part of that which stands on windows that were explained badly: none where all were explained well.
+    pub(super) fn doubt_beyond_least(&self, label: Label) -> f64 {
+        self.explained.get(&label).copied().unwrap_or_default().share_badly()
+    }
+
     /// Least and greatest position of each joint of the likeliest tree in the windows learned, by child
     /// \[m or rad\].
     pub fn ranges_seen(&self) -> BTreeMap<Label, (f64, f64)> {
@@ -355,13 +365,15 @@ impl Learner {
         let scene = self.scene(job);
         let doubted = !self.root_is_given && !measured.contains_key(&self.root) && scene.has_left(self.root);
         let scene = Scene { root: (!doubted).then_some(self.root), ..scene };
-        let bound = job.wrenches.iter().any(|wrench| wrench.part.is_some());
+        let bound = job.wrenches.iter().any(|wrench| wrench.tool && wrench.part.is_some());
         let (motions, contacts) = explain_contacts(&scene, &measured, !bound);
         let direct = poses.keys().filter_map(|label| Some((*label, self.posed.get(label)?.information))).collect();
         for (label, motion) in &motions {
+            // What goes along with another part says nothing of its own joint.
+            let rides = self.rides(*label, motion, &motions);
             let explained = self.explained.entry(*label).or_default();
             match motion.explained {
-                Some(true) if motion.moved => explained.well += 1.0,
+                Some(true) if motion.moved && !rides => explained.well += 1.0,
                 Some(false) => explained.badly += 1.0,
                 _ => {}
             }
@@ -381,6 +393,12 @@ impl Learner {
         self.touched.extend(contacts.iter().map(|c| c.label).filter(moved));
         for (label, motion) in &motions {
             self.tracks.entry(*label).or_default().push(motion.displacements.clone());
+        }
+        // What was taken for the root may turn out to be none: it has a track like the others.
+        let rested = self.models.keys().filter(|label| !self.root_is_given && !motions.contains_key(label));
+        for label in rested {
+            let place = self.displacements.get(label).copied().unwrap_or_else(Pose::identity);
+            self.tracks.entry(*label).or_default().push(vec![place; job.frames.len()]);
         }
         self.windows.push(observations);
         self.grow(job, &motions);
@@ -407,6 +425,16 @@ impl Learner {
         self.learn_dynamics(job, &contacts);
         self.record(job);
         self.retire();
+    }
+
+    /// Whether a part keeps its place on the one that carries it.
+    fn rides(&self, label: Label, motion: &Motion, motions: &BTreeMap<Label, Motion>) -> bool {
+        let (Some(model), Some(carrier)) = (self.models.get(&label), motion.carrier.and_then(|c| motions.get(&c)))
+        else {
+            return false;
+        };
+        let mut relative = carrier.displacements.iter().zip(&motion.displacements).map(|(c, own)| c.inverse() * *own);
+        relative.next().is_some_and(|first| relative.all(|place| travel(model, &first, &place) < RESTS))
     }
 
     fn learn_dynamics(&mut self, job: &WindowJob, contacts: &[Contact]) {
@@ -710,26 +738,26 @@ impl Learner {
         distinct
     }
 
+    /// Log weight of a joint between a part that moved and a parent (`None`: what never moved): the evidence
+    /// summed over joint types, and what the gap between them says beforehand; −∞ where there is none.
+    pub(super) fn log_edge_weight(&self, child: Label, parent: Option<Label>) -> f64 {
+        let options = self.evidence.get(&child).map_or(&[][..], Vec::as_slice);
+        let option = options.iter().find(|option| option.parent == parent);
+        option.map_or(f64::NEG_INFINITY, |o| log_sum_exp(&o.log_evidence) + self.log_contact_prior(child, parent))
+    }
+
     /// Log weights of the edges between what never moved (node 0) and the parts that did, in the
-    /// order of `evidence`: each the evidence summed over joint types.
+    /// order of `evidence`.
     fn edge_weights(&self) -> DMatrix<f64> {
-        let movers: Vec<Label> = self.evidence.keys().copied().collect();
-        let mut weights = DMatrix::from_element(movers.len() + 1, movers.len() + 1, f64::NEG_INFINITY);
-        for (column, options) in self.evidence.values().enumerate() {
-            for option in options {
-                let row = option.parent.map_or(Some(0), |p| movers.iter().position(|l| *l == p).map(|i| i + 1));
-                if let Some(row) = row {
-                    let prior = self.log_contact_prior(movers[column], option.parent);
-                    weights[(row, column + 1)] = log_sum_exp(&option.log_evidence) + prior;
-                }
-            }
-        }
-        weights
+        let nodes: Vec<Option<Label>> = std::iter::once(None).chain(self.evidence.keys().copied().map(Some)).collect();
+        DMatrix::from_fn(nodes.len(), nodes.len(), |row, column| {
+            nodes[column].map_or(f64::NEG_INFINITY, |child| self.log_edge_weight(child, nodes[row]))
+        })
     }
 
     /// Log prior of a joint between two parts by the gap between their surfaces: what is joined
     /// touches. `None`: the nearest of the parts that never moved.
-    pub(super) fn log_contact_prior(&self, child: Label, parent: Option<Label>) -> f64 {
+    fn log_contact_prior(&self, child: Label, parent: Option<Label>) -> f64 {
         if self.posed.contains_key(&child) || parent.is_some_and(|parent| self.posed.contains_key(&parent)) {
             return 0.0;
         }

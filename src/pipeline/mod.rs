@@ -22,7 +22,7 @@ use std::sync::Arc;
 
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
-pub use evaluate::{PartScore, Scores};
+pub use evaluate::{PartScore, ResidualSample, Scores, StageScore};
 pub use explain::Frame;
 pub use first_look::FirstLook;
 pub use learner::{Learner, ParentEvidence, WindowJob};

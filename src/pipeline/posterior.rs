@@ -2,12 +2,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use nalgebra::{DMatrix, Matrix3, Vector3};
+use nalgebra::{DMatrix, Matrix3, Vector2, Vector3};
 
 use super::poses::POSED_RADIUS;
 use super::{Learner, ParentEvidence, Pipeline};
 use crate::geometry::{HullProperties, hull_properties};
-use crate::math::log_sum_exp;
+use crate::math::{log_sum_exp, orthonormal_pair};
 use crate::mechanism::JointType;
 use crate::model::{Axis, DynamicsPosterior, JointDynamics, KinematicFit};
 use crate::registration::PartModel;
@@ -21,6 +21,8 @@ use crate::types::posterior::{
 /// Density of furniture parts over their hull, median \[kg/m³\] and standard deviation of its log:
 /// hollow drawers weigh 100, boards 600.
 const HULL_DENSITY: (f64, f64) = (250.0, 0.9);
+/// How far off an axis is whose part's motion was explained wrongly: directions \[rad\], positions \[m\].
+const WRONG_AXIS: [f64; 4] = [0.1, 0.1, 0.03, 0.03];
 /// The centre of mass of a part lies this share of its spread away from its hull's, per axis.
 const CENTER_SHARE: f64 = 0.3;
 
@@ -132,15 +134,13 @@ struct Known<'a> {
 fn edges(root: Label, labels: &[Label], known: Option<Known<'_>>) -> Vec<EdgePosterior> {
     let nodes: Vec<Label> = [root].into_iter().chain(labels.iter().copied().filter(|l| *l != root)).collect();
     let evidence = |child: Label| known.and_then(|known| known.learner.evidence.get(&child));
-    let mut log_weights = DMatrix::zeros(nodes.len(), nodes.len());
-    for (j, child) in nodes.iter().enumerate().skip(1) {
-        let Some(options) = evidence(*child) else { continue };
-        for (i, parent) in nodes.iter().enumerate() {
-            let moved = evidence(*parent).is_some();
-            log_weights[(i, j)] =
-                option_for(options, *parent, moved).map_or(f64::NEG_INFINITY, |o| log_sum_exp(&o.log_evidence));
+    // All parts that never moved are as good as the world; a part that never moved may hang on any.
+    let log_weights = DMatrix::from_fn(nodes.len(), nodes.len(), |i, j| match known {
+        Some(known) if j > 0 && evidence(nodes[j]).is_some() => {
+            known.learner.log_edge_weight(nodes[j], evidence(nodes[i]).map(|_| nodes[i]))
         }
-    }
+        _ => 0.0,
+    });
     let Ok(trees) = TreeDistribution::new(&log_weights) else { return Vec::new() };
     let mut found = Vec::new();
     for (j, child) in nodes.iter().enumerate().skip(1) {
@@ -180,7 +180,7 @@ fn edge(
         joint_type =
             JointTypeProbabilities { rigid: mixed(rigid), prismatic: mixed(prismatic), revolute: mixed(revolute) };
     }
-    let fitted = |joint_type| fitted_axis(option?, known?.learner, child, joint_type);
+    let fitted = |joint_type| fitted_axis(option?, known?, child, joint_type);
     let revolute = fitted(JointType::Revolute).map(|(axis, covariance)| RevoluteAxis {
         axis_direction: axis.direction.into(),
         axis_point_m: axis.point.into(),
@@ -236,15 +236,33 @@ fn index_in_fit(option: &ParentEvidence, fit: &KinematicFit, child: Label, joint
 /// The axis by the joint fit where the edge is in it, else by its own.
 fn fitted_axis(
     option: &ParentEvidence,
-    learner: &Learner,
+    known: Known<'_>,
     child: Label,
     joint_type: JointType,
 ) -> Option<(Axis, DMatrix<f64>)> {
+    let learner = known.learner;
     let own = option.fits[joint_type as usize].as_ref()?;
     let wide = DMatrix::from_diagonal_element(4, 4, 1.0);
     let Some(fit) = &learner.fit else { return Some((own.joint.axis, wide)) };
     let Some(index) = index_in_fit(option, fit, child, joint_type) else { return Some((own.joint.axis, wide)) };
     let joint = &fit.joints[index];
     let (offset, count) = (fit.axis_offset(index), joint.axis_parameters());
-    Some((joint.axis, fit.covariance.view((offset, offset), (count, count)).into_owned()))
+    let mut covariance = fit.covariance.view((offset, offset), (count, count)).into_owned();
+    let mut axis = joint.axis;
+    let dynamics = learned_dynamics(option, known, child, joint_type);
+    if let Some((turn, spread)) = dynamics.and_then(|dynamics| dynamics.turn) {
+        axis.direction = turned(&axis.direction, &turn);
+        covariance.fixed_view_mut::<2, 2>(0, 0).copy_from(&spread);
+    }
+    let doubt = learner.doubt_beyond_least(child);
+    for (i, deviation) in WRONG_AXIS.into_iter().enumerate().take(count) {
+        covariance[(i, i)] += doubt * deviation.powi(2);
+    }
+    Some((axis, covariance))
+}
+
+/// A direction after small turns about the two directions across it \[rad\].
+fn turned(direction: &Vector3<f64>, turn: &Vector2<f64>) -> Vector3<f64> {
+    let (first, second) = orthonormal_pair(direction);
+    (direction + (first * turn.x + second * turn.y).cross(direction)).normalize()
 }

@@ -109,6 +109,11 @@ pub struct Filter {
     cursor: usize,
 }
 
+/// Standard deviation of the unexplained force on a joint \[N or N·m\].
+fn disturbance_deviation(mechanism: &TrackedMechanism, tree: &Tree<f64>, joint: usize) -> f64 {
+    (DISTURBANCE * tree.bodies()[joint].parameters.friction).hypot(mechanism.unexplained[joint])
+}
+
 impl Filter {
     /// A filter that starts at `time_s` from positions \[m or rad\] and rates, the positions known to
     /// `deviation` \[m\] of the part's points and the rates to `rate_deviation` \[m/s\].
@@ -129,7 +134,7 @@ impl Filter {
             covariance[(n + joint, n + joint)] =
                 if rates[joint] == 0.0 { 0.0 } else { (rate_deviation / reach).powi(2) };
             covariance[(2 * n + 3 + joint, 2 * n + 3 + joint)] =
-                (DISTURBANCE * mechanism.tree.bodies()[joint].parameters.friction).powi(2);
+                disturbance_deviation(&mechanism, &mechanism.tree, joint).powi(2);
         }
         let start_of_numbers = 3 * n + 3;
         covariance.view_mut((start_of_numbers, start_of_numbers), (count, count)).copy_from(&mechanism.covariance);
@@ -347,8 +352,9 @@ impl Filter {
             self.fade(span);
             return;
         }
-        let first = samples.partition_point(|s| s.stamp_s < self.time_s - 0.05);
-        let last = samples.partition_point(|s| s.stamp_s <= to_s + 0.02);
+        let delay_s = self.mechanism.sensor.delay_s;
+        let first = samples.partition_point(|s| s.stamp_s < self.time_s - 0.05 + delay_s.min(0.0));
+        let last = samples.partition_point(|s| s.stamp_s <= to_s + 0.02 + delay_s.max(0.0));
         let samples = &samples[first..last.max(first)];
         self.cursor = 0;
         let pieces = ((to_s - self.time_s) / LINEAR - 1e-6).ceil().max(1.0) as usize;
@@ -364,7 +370,8 @@ impl Filter {
         let span = [self.time_s, to_s];
         let joints = self.moving_joints();
         let resting = self.resting();
-        let drive = Drive { held: self.held, samples, resting: &resting, step_s: STEP };
+        let sensor = self.mechanism.sensor;
+        let drive = Drive { held: self.held, samples, sensor, resting: &resting, step_s: STEP };
         let coordinates = self.coordinates_of(&joints);
         // (q, q̇) of the moving joints by each of their coordinates.
         let mut slopes = DMatrix::zeros(2 * joints.len(), coordinates.len());
@@ -508,8 +515,8 @@ impl Filter {
             self.disturbance[joint] *= faded;
             self.covariance.row_mut(at).scale_mut(faded);
             self.covariance.column_mut(at).scale_mut(faded);
-            let friction = self.tree.bodies()[joint].parameters.friction;
-            let stationary = (DISTURBANCE * friction).powi(2) * self.unease.min(MOST_DISTURBED);
+            let stationary =
+                disturbance_deviation(&self.mechanism, &self.tree, joint).powi(2) * self.unease.min(MOST_DISTURBED);
             self.covariance[(at, at)] += stationary * (1.0 - faded * faded);
         }
     }
@@ -665,9 +672,9 @@ impl Filter {
         for joint in 0..n {
             self.state.positions[joint] += change[joint];
             self.state.rates[joint] += change[n + joint];
-            let friction = self.tree.bodies()[joint].parameters.friction;
+            let most = self.tree.bodies()[joint].parameters.friction + 3.0 * self.mechanism.unexplained[joint];
             let disturbance = self.disturbance[joint] + change[2 * n + 3 + joint];
-            self.disturbance[joint] = disturbance.clamp(-friction, friction);
+            self.disturbance[joint] = disturbance.clamp(-most, most);
         }
         self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
         if let Some(held) = &mut self.held {

@@ -99,7 +99,7 @@ impl Filter {
     ) -> Option<Path> {
         let Start { mut tree, mut state, mut disturbance, held } = self.start(changes)?;
         let resting = self.resting();
-        let drive = Drive { held, samples, resting: &resting, step_s };
+        let drive = Drive { held, samples, sensor: self.mechanism.sensor, resting: &resting, step_s };
         let mut workspace = Workspace::new(&tree);
         let mut cursor = 0;
         let first = self.state.positions.clone();

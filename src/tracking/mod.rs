@@ -12,7 +12,6 @@ mod mechanism;
 mod mixture;
 mod plan;
 mod presence;
-mod score;
 mod simulation;
 mod skill;
 #[cfg(test)]
@@ -26,5 +25,4 @@ pub use mechanism::{ActiveNumber, TrackedMechanism, TreeFamily};
 pub use mixture::{FreeAccount, JointAccount, Mixed, mixture};
 pub use plan::{Plan, PlannedPose};
 pub use presence::{Account, Presence};
-pub use score::{MeasuredPath, ResidualSum};
 pub use skill::Skill;

@@ -46,6 +46,8 @@ pub(super) fn drawer(damping: f64) -> TrackedMechanism {
         centers: vec![Vector3::zeros()],
         tool_offset: Vector3::new(0.002, -0.001, 0.0),
         noise_scale: 1.0,
+        sensor: crate::model::SensorError::none(),
+        unexplained: vec![0.0],
     }
 }
 

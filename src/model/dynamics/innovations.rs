@@ -113,12 +113,13 @@ impl Innovations {
 }
 
 /// Directions that one simulation of a single joint carries derivatives along.
-const CHUNK: usize = 6;
+const CHUNK: usize = 8;
 /// Step of finite differences where several joints move. Dual numbers through a chain of three cost
 /// 60 ms a window in copies, one more simulation .3 ms; away from switches the two agree to 1e-5.
 const DIFFERENCE: f64 = 1e-6;
 
 /// What a simulation needs of the parameters.
+#[derive(Clone)]
 pub(super) struct Plant<T: Real> {
     pub(super) tree: Tree<T>,
     sensor: SensorError<T>,

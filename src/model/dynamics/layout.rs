@@ -4,9 +4,10 @@
 //! "Modeling, Identification and Control of Robots", 2002, chapter 9): a body's inertia about its
 //! own joint, and where gravity or an ancestor shows them its mass and its centre of mass across the
 //! axis. The first moment itself would be linear in the equations, but its prior is not Gaussian:
-//! a mass within a factor of three times a centre within a few centimetres.
+//! a mass within a factor of three times a centre within a few centimetres. In logs their product is a
+//! sum: what gravity shows of a hinge is one straight line for all windows.
 
-use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix2, Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::HullProperties;
@@ -28,18 +29,25 @@ pub const LOWER: usize = 3;
 pub const UPPER: usize = 4;
 /// ln mass \[kg\] of a body on a hinge.
 pub const MASS: usize = 5;
-/// First of two components of the centre of mass across the axis \[m\]: from the axis of a hinge,
+/// First of two numbers of the centre of mass across the axis, see [`CenterFrame`]: from the axis of a hinge,
 /// from the hull's centre on a slide.
 pub const CENTER: usize = 6;
+/// First of two components of the error of the axis's direction, see [`TiltFrame`] \[rad\].
+pub const TILT: usize = 8;
 /// Numbers of a joint without effects; those of its effects follow.
-pub const SIZE: usize = 8;
+pub const SIZE: usize = 10;
 
 /// Density of a hull \[kg/m³\], and how far off it may be (standard deviation of its logarithm):
 /// measured 97 for hollow drawers and 300 for doors (DESIGN.md section 9).
 const DENSITY: f64 = 200.0;
 const LOG_DENSITY_DEVIATION: f64 = 1.2;
-/// Standard deviation of ln(inertia / mass): shapes are better known than densities.
-const LOG_SHAPE_DEVIATION: f64 = 0.35;
+/// Standard deviation of ln(inertia / mass) where the centre of mass is known: shapes are better known than
+/// densities. On 23 hinges of this project's generator .07, without the centre .15; furniture is less even.
+const LOG_SHAPE_DEVIATION: f64 = 0.15;
+/// A centre of mass this many standard deviations off the axis is written by its distance and angle.
+const CLEARLY_OFF: f64 = 1.5;
+/// An axis within 30° of gravity is that of a door; further than that a slide's.
+const UPRIGHT: f64 = 0.87;
 /// Standard deviation of the centre of mass, in spreads of the part's points: a uniform panel's
 /// spread is .29 of its extent, so this is 15 % of the extent.
 const CENTER_DEVIATION: f64 = 0.5;
@@ -111,7 +119,7 @@ impl Default for SensorModel {
 pub const SENSOR_SIZE: usize = 7;
 
 /// What the sensor's numbers mean.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SensorError<T: Real> {
     /// What it adds to the force \[N\].
     pub force_bias: Vector3<T>,
@@ -119,6 +127,107 @@ pub struct SensorError<T: Real> {
     pub torque_bias: Vector3<T>,
     /// δ: the wrench acting at t is the one reported at t + δ \[s\].
     pub delay_s: T,
+}
+
+impl<T: Real> SensorError<T> {
+    /// A sensor without errors.
+    pub fn none() -> Self {
+        Self { force_bias: Vector3::zeros(), torque_bias: Vector3::zeros(), delay_s: T::zero() }
+    }
+}
+
+/// How a centre of mass across an axis is written.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CenterFrame {
+    /// Two directions across the axis.
+    pub basis: [Vector3<f64>; 2],
+    /// By ln distance \[m\] from the axis and angle \[rad\] from the first direction, that of the hull's
+    /// centre; else by its components \[m\].
+    pub polar: bool,
+}
+
+impl CenterFrame {
+    /// The frame of a joint's child; `across`: the axis that its centre shows about.
+    fn new(joint: &KinematicJoint, hull: &HullProperties, across: &Vector3<f64>) -> Self {
+        let arm = hull.center - joint.axis.point;
+        let offset = arm - joint.axis.direction * joint.axis.direction.dot(&arm);
+        if let (JointType::Revolute, Some(out)) = (joint.joint_type, offset.try_normalize(1e-6))
+            && offset.norm() > CLEARLY_OFF * center_deviation(hull, &out)
+        {
+            return Self { basis: [out, joint.axis.direction.cross(&out)], polar: true };
+        }
+        let (first, second) = orthonormal_pair(across);
+        Self { basis: [first, second], polar: false }
+    }
+
+    /// From the axis, or the hull's centre, to the centre of mass \[m\].
+    fn arm<T: Real>(&self, x: &[T]) -> Vector3<T> {
+        let [first, second] = self.basis.map(|direction| direction.map(T::constant));
+        if self.polar {
+            (first * x[CENTER + 1].cos() + second * x[CENTER + 1].sin()) * x[CENTER].exp()
+        } else {
+            first * x[CENTER] + second * x[CENTER + 1]
+        }
+    }
+
+    /// Both numbers of an arm \[m\], and by how much they change per metre along either direction.
+    fn numbers(&self, arm: &Vector3<f64>) -> ([f64; 2], f64) {
+        let [along, aside] = self.basis.map(|direction| direction.dot(arm));
+        if self.polar {
+            ([0.5 * (along * along + aside * aside).ln(), aside.atan2(along)], along.hypot(aside).recip())
+        } else {
+            ([along, aside], 1.0)
+        }
+    }
+}
+
+/// In which directions an axis may be off by more than gravity would let pass: what pulls along a slide
+/// that is not quite level, or turns a door that is not quite upright, is weight and no force of its own.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TiltFrame {
+    /// Two directions across the axis, on a slide the first as upright as can be.
+    pub basis: [Vector3<f64>; 2],
+    /// How many of them gravity shows.
+    pub shown: usize,
+}
+
+impl TiltFrame {
+    fn new(joint: &KinematicJoint, gravity: &Vector3<f64>) -> Self {
+        let n = joint.axis.direction;
+        let (first, second) = orthonormal_pair(&n);
+        let Some(down) = gravity.try_normalize(1e-6) else { return Self { basis: [first, second], shown: 0 } };
+        let upright = n.dot(&down).abs() > UPRIGHT;
+        match ((down - n * n.dot(&down)).try_normalize(1e-6), joint.joint_type) {
+            (_, JointType::Revolute) if upright => Self { basis: [first, second], shown: 2 },
+            (Some(steepest), JointType::Prismatic) if !upright => {
+                Self { basis: [steepest, n.cross(&steepest)], shown: 1 }
+            }
+            _ => Self { basis: [first, second], shown: 0 },
+        }
+    }
+
+    /// What the numbers add to the direction.
+    fn tilt<T: Real>(&self, x: &[T]) -> Vector3<T> {
+        let shown = self.basis.iter().enumerate().take(self.shown);
+        shown.fold(Vector3::zeros(), |sum, (i, basis)| sum + basis.map(T::constant) * x[TILT + i])
+    }
+
+    /// The numbers of a small change of the direction.
+    pub fn numbers(&self, change: &Vector3<f64>) -> [f64; 2] {
+        self.basis.map(|basis| basis.dot(change))
+    }
+
+    /// Takes the axis's own two turns \[rad\] to the numbers: a turn by a f + b s adds b f − a s.
+    pub fn from_turns(&self, axis: &Axis) -> Matrix2<f64> {
+        let (first, second) = orthonormal_pair(&axis.direction);
+        Matrix2::from_fn(|i, j| if j == 0 { -self.basis[i].dot(&second) } else { self.basis[i].dot(&first) })
+    }
+}
+
+/// Standard deviation of a centre of mass about its hull's along a direction \[m\].
+fn center_deviation(hull: &HullProperties, direction: &Vector3<f64>) -> f64 {
+    let spread = hull.spread.dot(&direction.abs()).max(0.01);
+    if hull.is_guess() { GUESS_DEVIATIONS.2 } else { CENTER_DEVIATION * spread }
 }
 
 /// All that is fixed of one joint and its body.
@@ -134,8 +243,10 @@ pub struct JointModel {
     pub stops: [bool; 2],
     /// Whether its centre of mass shows: on a hinge that gravity loads, or that is carried.
     pub center_shows: bool,
-    /// The two directions of the centre of mass.
-    pub center_basis: [Vector3<f64>; 2],
+    /// How its centre of mass is written.
+    pub center: CenterFrame,
+    /// How its axis may be tilted.
+    pub tilt: TiltFrame,
     /// Whether Coulomb friction is in the model.
     pub friction: bool,
     /// Effects beyond that, whose numbers follow.
@@ -181,6 +292,7 @@ impl JointModel {
         if self.center_shows {
             active.extend([CENTER, CENTER + 1]);
         }
+        active.extend(TILT..TILT + self.tilt.shown);
         active.extend(SIZE..self.size());
         active
     }
@@ -231,12 +343,19 @@ impl JointModel {
             mean[place] = position;
             map[(place, place)] = if self.stops[i] { LIMIT_DEVIATION } else { 1.0 };
         }
-        let offset = self.hull.center - self.foot(&self.joint.axis);
-        for (i, basis) in self.center_basis.iter().enumerate() {
-            let revolute = self.joint.joint_type == JointType::Revolute;
-            mean[CENTER + i] = if revolute { offset.dot(basis) } else { 0.0 };
-            let spread = self.hull.spread.dot(&basis.abs()).max(0.01);
-            map[(CENTER + i, CENTER + i)] = guess.map_or(CENTER_DEVIATION * spread, |(_, _, center)| center);
+        let offset = match self.joint.joint_type {
+            JointType::Revolute => self.hull.center - self.foot(&self.joint.axis),
+            _ => Vector3::zeros(),
+        };
+        let (numbers, per_metre) = self.center.numbers(&offset);
+        for (i, (basis, number)) in self.center.basis.iter().zip(numbers).enumerate() {
+            let deviation = center_deviation(&self.hull, basis);
+            mean[CENTER + i] = number;
+            map[(CENTER + i, CENTER + i)] = deviation * per_metre;
+            // Inertia goes with the distance: d ln (k² + |c|²) = 2 c·dc / (k² + |c|²).
+            if self.joint.joint_type == JointType::Revolute {
+                map[(INERTIA, CENTER + i)] = 2.0 * offset.dot(basis) * deviation / self.inertia_per_mass();
+            }
         }
         let mut covariance = &map * map.transpose();
         for (i, table) in self.tables.iter().enumerate() {
@@ -253,8 +372,7 @@ impl JointModel {
     /// The body's inertial properties at the reference configuration from the joint's numbers.
     fn inertia<T: Real>(&self, x: &[T], axis: &Axis) -> (T, Vector3<T>, Matrix3<T>) {
         let shape = self.shape();
-        let arm =
-            self.center_basis[0].map(T::constant) * x[CENTER] + self.center_basis[1].map(T::constant) * x[CENTER + 1];
+        let arm = self.center.arm(x);
         match self.joint.joint_type {
             JointType::Revolute => {
                 let mass = x[MASS].exp();
@@ -359,10 +477,15 @@ impl Mechanism {
             let (mass, com, about_com) = model.inertia(own, &axes[k]);
             let here = frozen[k].map_or(parent, |q| parent * screw.displacement(q));
             let pose = Pose::constant(&here);
+            let tilt = model.tilt.tilt(own);
+            let turned = match model.joint.joint_type {
+                JointType::Prismatic => Screw::prismatic(&tilt),
+                _ => Screw::revolute(&tilt, &axes[k].point.map(T::constant)),
+            };
             let body = Body {
                 parent: model.joint.parent,
                 joint: if frozen[k].is_some() { JointType::Rigid } else { model.joint.joint_type },
-                screw: Screw(parent.adjoint(&screw.0).map(T::constant)),
+                screw: Screw(Pose::constant(&parent).adjoint(&(screw.0.map(T::constant) + turned.0))),
                 mass,
                 com_in_world: pose.transform_point(&com),
                 inertia_about_com: pose.rotation * about_com * pose.rotation.transpose(),
@@ -412,18 +535,38 @@ pub fn joint_models(
             } else {
                 (hinge_above(k).is_some(), hinge_above(k).unwrap_or(joint.axis.direction))
             };
-            let (first, second) = orthonormal_pair(&across);
+            let hull = hull(joint);
             JointModel {
                 joint: *joint,
-                hull: hull(joint),
+                center: CenterFrame::new(joint, &hull, &across),
+                tilt: TiltFrame::new(joint, gravity),
+                hull,
                 scales: scales[k],
                 stops: stops[k],
                 center_shows,
-                center_basis: [first, second],
                 friction: true,
                 effects: Vec::new(),
                 tables: Vec::new(),
             }
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_centre_of_mass_is_what_its_numbers_say() {
+        for polar in [true, false] {
+            let frame = CenterFrame { basis: [Vector3::x(), Vector3::y()], polar };
+            let arm = Vector3::new(0.2, -0.05, 0.0);
+            let (numbers, per_metre) = frame.numbers(&arm);
+            let mut x = [0.0; SIZE];
+            x[CENTER..CENTER + 2].copy_from_slice(&numbers);
+            assert!((frame.arm(&x) - arm).norm() < 1e-12);
+            let expected = if polar { 1.0 / arm.norm() } else { 1.0 };
+            assert!((per_metre - expected).abs() < 1e-9);
+        }
+    }
 }

@@ -2,12 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::{DMatrix, DVector, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix2, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::layout::{
-    AddedEffect, AddedTable, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism, SENSOR_SIZE, SIZE,
-    SensorModel, UPPER, joint_models,
+    AddedEffect, AddedTable, CenterFrame, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism, SENSOR_SIZE,
+    SIZE, SensorModel, TILT, TiltFrame, UPPER, joint_models,
 };
 use super::site::{FittedWindow, WindowFit, inertial_entries, load_factor};
 use super::track::{Drive, TrackKinematics, TrackSource, driven_labels, joint_track, touched_label};
@@ -31,6 +31,9 @@ const SHORTEST_HALT: f64 = 0.1;
 const TYPICAL_RECORD_S: f64 = 4.0;
 /// A stop is believed if it raises the log evidence by this.
 const STOP_EVIDENCE: f64 = 4.0;
+
+/// Directions are not known better than this \[rad\].
+const LEAST_TILT: f64 = 1e-4;
 
 /// What a block of numbers is about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -82,7 +85,8 @@ pub(super) struct JointMemory {
     pub(super) stops: [bool; 2],
     /// Where the stops are expected, once they are believed.
     pub(super) stop_positions: [f64; 2],
-    center_basis: Option<[Vector3<f64>; 2]>,
+    center: Option<CenterFrame>,
+    tilt: Option<TiltFrame>,
     hull: Option<HullProperties>,
     pub(super) friction: bool,
     pub(super) effects: Vec<AddedEffect>,
@@ -105,6 +109,16 @@ pub(super) struct WindowMemory {
 }
 
 impl WindowMemory {
+    /// The site is carried over to this fit.
+    fn moved_to(&mut self, fit: &KinematicFit) {
+        for (label, axis) in &mut self.axes {
+            if let Some(joint) = fit.joints.iter().find(|joint| joint.child == *label) {
+                *axis = joint.axis;
+            }
+        }
+        self.tool_offset = fit.tool_offset;
+    }
+
     /// The site was made with the axes and the offset of this fit.
     pub(super) fn made_with(&mut self, fit: &KinematicFit) {
         self.axes = fit.joints.iter().map(|j| (j.child, j.axis)).collect();
@@ -244,7 +258,8 @@ impl DynamicsLearner {
                     scales: None,
                     stops: [false; 2],
                     stop_positions: [0.0; 2],
-                    center_basis: None,
+                    center: None,
+                    tilt: None,
                     hull,
                     friction: self.declared.friction,
                     effects: Vec::new(),
@@ -335,7 +350,8 @@ impl DynamicsLearner {
             let Some(memory) = self.joints.get_mut(&label) else {
                 continue;
             };
-            model.center_basis = *memory.center_basis.get_or_insert(model.center_basis);
+            model.center = *memory.center.get_or_insert(model.center);
+            model.tilt = *memory.tilt.get_or_insert(model.tilt);
             model.friction = memory.friction;
             model.effects.clone_from(&memory.effects);
             model.tables.clone_from(&memory.tables);
@@ -346,6 +362,7 @@ impl DynamicsLearner {
                 Some(old) => extended(&with_stops(&old.gaussian, memory), model)?,
                 None => model.prior(memory.stop_positions)?,
             };
+            let gaussian = with_tilt(gaussian, model, fit);
             let size = model.size();
             self.belief.set_prior(block, Factor { blocks: vec![(block, size)], gaussian });
         }
@@ -370,7 +387,7 @@ impl DynamicsLearner {
 
     /// Carries the sites' kinematic errors over to the new fit: old = turn · new + shift.
     fn recenter(&mut self, fit: &KinematicFit) {
-        let (windows, past) = (&mut self.windows, &mut self.past);
+        let (windows, past, models) = (&mut self.windows, &mut self.past, &self.mechanism.joints);
         for (site, factor) in self.belief.sites_mut() {
             let memory = match site {
                 Site::Window(window) => windows.get_mut(*window),
@@ -383,11 +400,14 @@ impl DynamicsLearner {
             let mut map = DMatrix::identity(size, size);
             let mut shift = DVector::zeros(size);
             let mut at = 0;
+            let axes_of = |label: &Label| {
+                let new = fit.joints.iter().find(|j| j.child == *label).map(|j| j.axis);
+                memory.axes.get(label).copied().zip(new)
+            };
             for (block, length) in &factor.blocks {
                 match block {
                     Block::Axis(label) => {
-                        let new = fit.joints.iter().find(|j| j.child == *label).map(|j| j.axis);
-                        if let (Some(old), Some(new)) = (memory.axes.get(label).copied(), new) {
+                        if let Some((old, new)) = axes_of(label) {
                             let (turn, moved) = axis_change(&old, &new);
                             for i in 0..*length {
                                 shift[at + i] = moved[i];
@@ -395,19 +415,25 @@ impl DynamicsLearner {
                                     map[(at + i, at + j)] = turn[(i, j)];
                                 }
                             }
-                            memory.axes.insert(*label, new);
+                        }
+                    }
+                    Block::Dynamics(label) => {
+                        let model = models.iter().find(|model| model.joint.child == *label);
+                        if let (Some((old, new)), Some(model)) = (axes_of(label), model) {
+                            let tilt = model.tilt.numbers(&(new.direction - old.direction));
+                            (0..model.tilt.shown).for_each(|i| shift[at + TILT + i] = tilt[i]);
                         }
                     }
                     Block::ToolOffset => {
                         for i in 0..3 {
                             shift[at + i] = fit.tool_offset[i] - memory.tool_offset[i];
                         }
-                        memory.tool_offset = fit.tool_offset;
                     }
-                    Block::Dynamics(_) | Block::Sensor => {}
+                    Block::Sensor => {}
                 }
                 at += length;
             }
+            memory.moved_to(fit);
             factor.gaussian = factor.gaussian.pull_back(&map, &shift);
         }
     }
@@ -725,8 +751,11 @@ impl DynamicsLearner {
         let mut deviations = vec![0.0; covariance.nrows()];
         for &(joint, whole) in involved {
             let start = fit.axis_offset(joint);
+            // What a slide's direction does is a number of its own.
+            let sliding = self.mechanism.joints[joint].joint.joint_type == JointType::Prismatic;
+            let own = sliding && self.mechanism.joints[joint].tilt.shown > 0;
             for i in start..start + fit.joints[joint].axis_parameters() {
-                deviations[i] = if whole { covariance[(i, i)].max(0.0).sqrt() } else { 0.0 };
+                deviations[i] = if whole && !own { covariance[(i, i)].max(0.0).sqrt() } else { 0.0 };
             }
         }
         let start = deviations.len() - 3;
@@ -858,6 +887,21 @@ fn axis_change(old: &Axis, new: &Axis) -> (DMatrix<f64>, [f64; 4]) {
     let along = old.direction.dot(&(new.point - old.point)) / old.direction.dot(&new.direction);
     let moved = new.point - new.direction * along - old.point;
     (map, [-s0.dot(&new.direction), f0.dot(&new.direction), f0.dot(&moved), s0.dot(&moved)])
+}
+
+/// A joint's prior with the error of its axis's direction as the kinematic fit states it.
+fn with_tilt(mut prior: Gaussian, model: &JointModel, fit: &KinematicFit) -> Gaussian {
+    let mut covariance = Matrix2::identity() * LEAST_TILT.powi(2);
+    let fitted = fit.joints.iter().position(|joint| joint.child == model.joint.child);
+    if let Some(k) = fitted.filter(|_| model.tilt.shown > 0) {
+        let at = fit.axis_offset(k);
+        let turns = model.tilt.from_turns(&fit.joints[k].axis);
+        covariance += turns * fit.covariance.fixed_view::<2, 2>(at, at) * turns.transpose();
+    }
+    let precision = covariance.try_inverse().unwrap_or_else(|| Matrix2::identity() * LEAST_TILT.powi(-2));
+    prior.precision.fixed_view_mut::<2, 2>(TILT, TILT).copy_from(&precision);
+    prior.information.fixed_rows_mut::<2>(TILT).fill(0.0);
+    prior
 }
 
 /// A joint's prior with its stops where they are believed.

@@ -1,11 +1,13 @@
 //! The posterior of the dynamics, as it is published.
 
-use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix2, Matrix3, Vector2, Vector3};
 
-use super::layout::{CENTER, DAMPING, FRICTION, INERTIA, LOWER, MASS, UPPER};
+use super::layout::{
+    AddedTable, CENTER, DAMPING, FRICTION, INERTIA, JointModel, LOWER, MASS, SensorError, TILT, UPPER,
+};
 use super::learner::DynamicsLearner;
 use crate::inference::Failure;
-use crate::mechanism::effects::EffectKind;
+use crate::mechanism::effects::{EffectKind, TableKind};
 use crate::mechanism::{JointType, Tree};
 use crate::types::Label;
 use crate::types::posterior::{InformedBy, Quantity};
@@ -26,6 +28,9 @@ pub struct JointDynamics {
     pub friction: Quantity,
     /// M_jj at q = 0.
     pub joint_inertia: Quantity,
+    /// Where gravity shows how a slide lies: by how much its direction is off in the axis's own two turns
+    /// \[rad\], and their covariance.
+    pub turn: Option<(Vector2<f64>, Matrix2<f64>)>,
     /// End stops, where there are any known.
     pub lower_limit: Option<Quantity>,
     /// The upper one.
@@ -111,8 +116,14 @@ impl DynamicsLearner {
                     Ok(Quantity::from_log_normal(unit, value, deviation, InformedBy::Dynamics))
                 }
             };
+            let turn = (!revolute && model.tilt.shown > 0).then(|| {
+                let back = model.tilt.from_turns(&model.joint.axis).transpose();
+                let tilt: Vector2<f64> = posterior.mean.fixed_rows::<2>(at + TILT).into();
+                (back * tilt, back * posterior.covariance.fixed_view::<2, 2>(at + TILT, at + TILT) * back.transpose())
+            });
             posterior.joints.push(JointDynamics {
                 label: model.joint.child,
+                turn,
                 damping: resisting(units[0], DAMPING, 2)?,
                 friction: resisting(units[1], FRICTION, 0)?,
                 joint_inertia: Quantity::from_log_normal(
@@ -182,6 +193,27 @@ impl DynamicsLearner {
         let axes: Vec<_> = mechanism.joints.iter().map(|m| m.joint.axis).collect();
         let frozen = vec![None; axes.len()];
         move |numbers| mechanism.tree(numbers.as_slice(), &axes, &frozen).ok()
+    }
+
+    /// The wrench sensor's errors, by numbers as [`DynamicsPosterior::mean`] has them.
+    pub fn sensor_error(&self, numbers: &DVector<f64>) -> SensorError<f64> {
+        self.mechanism.sensor_error(numbers.as_slice())
+    }
+
+    /// By joint, the root mean square of a force over time that has no name: what it will be is not known
+    /// \[N or N·m\].
+    pub fn unexplained_forces(&self, numbers: &DVector<f64>) -> Vec<f64> {
+        let of_joint = |(k, model): (usize, &JointModel)| {
+            let over_time =
+                |table: &&AddedTable| matches!(table.kind, TableKind::ForceOverTime | TableKind::FrictionOverTime);
+            let squares = model.tables.iter().enumerate().filter(|(_, table)| over_time(table)).map(|(t, table)| {
+                let first = self.mechanism.offset(k) + model.table_offset(t);
+                let entries = (first..first + table.nodes.len()).filter_map(|at| numbers.get(at));
+                entries.map(|entry| (entry * table.scale).powi(2)).sum::<f64>() / table.nodes.len().max(1) as f64
+            });
+            squares.sum::<f64>().sqrt()
+        };
+        self.mechanism.joints.iter().enumerate().map(of_joint).collect()
     }
 
     /// The numbers that the equations of motion hold: (joint, place in [`DynamicsPosterior::mean`]).

@@ -15,7 +15,7 @@ use super::posterior::DynamicsPosterior;
 use super::track::{TrackKinematics, TrackSource, joint_track};
 use crate::geometry::HullProperties;
 use crate::inference::{Sampler, SamplingSettings};
-use crate::math::{Pose, Screw};
+use crate::math::{Pose, Screw, orthonormal_pair};
 use crate::mechanism::{Body, JointParameters, JointType, State, Tree, WrenchSample, WrenchTrack, rollout};
 use crate::model::{Axis, Contact, KinematicFit, KinematicJoint, WindowObservations};
 use crate::types::{AppliedWrench, Label, Stamp};
@@ -191,6 +191,15 @@ impl Truth {
     }
 
     fn learn(&self, count: usize, rng: &mut ChaCha8Rng) -> DynamicsPosterior {
+        self.learn_by(count, rng, |positions| self.fit(positions))
+    }
+
+    fn learn_by(
+        &self,
+        count: usize,
+        rng: &mut ChaCha8Rng,
+        fit: impl Fn(&[Vec<Vec<f64>>]) -> KinematicFit,
+    ) -> DynamicsPosterior {
         let mut learner = DynamicsLearner::new(GRAVITY);
         let mut windows = Vec::new();
         let mut positions = Vec::new();
@@ -207,7 +216,7 @@ impl Truth {
                 parts: &self.hulls,
                 use_tool: true,
             };
-            let result = learner.learn_window(&self.fit(&positions), &input);
+            let result = learner.learn_window(&fit(&positions), &input);
             assert_eq!(result.failure, None);
         }
         learner.posterior().unwrap()
@@ -226,6 +235,33 @@ fn single_joints_are_recovered() {
         {
             assert!((quantity.median / truth - 1.0).abs() < 0.05, "{quantity:?}, truth {truth}");
         }
+    }
+}
+
+#[test]
+fn gravity_shows_how_a_slide_lies() {
+    let (damping, friction, tilt) = (8.0, 3.0, 0.03);
+    let truth = Truth::single(false, damping, friction, 2.5);
+    let tilted = |positions: &[Vec<Vec<f64>>]| {
+        let mut fit = truth.fit(positions);
+        fit.joints[0].axis.direction = Vector3::new(1.0, 0.0, tilt).normalize();
+        fit.covariance.view_mut((0, 0), (2, 2)).fill_diagonal(0.02 * 0.02);
+        fit
+    };
+    let found = truth.learn_by(3, &mut ChaCha8Rng::seed_from_u64(3), tilted);
+    let joint = &found.joints[0];
+    let (turn, covariance) = joint.turn.unwrap();
+    let axis = Vector3::new(1.0, 0.0, tilt).normalize();
+    let (first, second) = orthonormal_pair(&axis);
+    let level = axis + (first * turn.x + second * turn.y).cross(&axis);
+    let steepest = Vector3::z();
+    let spread = {
+        let along = nalgebra::Vector2::new(first.cross(&axis).dot(&steepest), second.cross(&axis).dot(&steepest));
+        along.dot(&(covariance * along)).sqrt()
+    };
+    assert!(level.z.abs() < 0.003 && spread < 0.005, "{level:?} ± {spread}");
+    for (quantity, truth) in [(&joint.damping, damping), (&joint.friction, friction)] {
+        assert!((quantity.median / truth - 1.0).abs() < 0.05, "{quantity:?}, truth {truth}");
     }
 }
 
