@@ -1,6 +1,6 @@
 //! Recorded tables → bags → posteriors: `bom import`, then `bom replay`, on simulated tables and on the
 //! public records beside this repository.
-#![allow(clippy::unwrap_used, clippy::print_stderr)]
+#![allow(clippy::unwrap_used)]
 
 mod command;
 
@@ -19,7 +19,7 @@ use bayesian_object_models::{
         posterior::{EdgePosterior, ObjectPosterior},
     },
 };
-use command::{bom, ours};
+use command::{bom, measured, ours};
 use nalgebra::{Matrix3, Vector3};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -323,16 +323,6 @@ fn errors_name_file_column_and_line() {
         assert!(outcome.err.contains(expected), "{} lacks {expected}", outcome.err);
         assert_eq!(outcome.err.lines().count(), 1, "{}", outcome.err);
     }
-}
-
-/// A folder of the public records, or nothing and a line that says so.
-fn measured(name: &str) -> Option<PathBuf> {
-    let path = ours("../shared/measured").join(name);
-    if !path.exists() {
-        eprintln!("SKIPPED: {} is not there", path.display());
-        return None;
-    }
-    Some(path)
 }
 
 #[test]

@@ -14,6 +14,7 @@ use std::{
     sync::{Mutex, MutexGuard, PoisonError},
 };
 
+use bayesian_object_models::io::bag::Bag;
 use serde_json::{Value, json};
 
 /// One at a time: they measure rates on a machine that has few cores.
@@ -30,14 +31,21 @@ struct Bench {
 }
 
 impl Bench {
-    /// Starts the node with these arguments; nothing where there is no ROS 2.
+    /// Starts the node with these ROS arguments; nothing where there is no ROS 2.
     fn start(domain: u32, arguments: &[&str]) -> Option<Self> {
+        Self::start_recording(domain, None, arguments)
+    }
+
+    /// The same, recording.
+    fn start_recording(domain: u32, record: Option<&Path>, arguments: &[&str]) -> Option<Self> {
         let environment = ros::environment()?;
         let turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
         let folder = tempfile::tempdir().unwrap();
         let log = folder.path().join("node.log");
         let node = Command::new(env!("CARGO_BIN_EXE_bom"))
-            .args(["node", "--ros-args"])
+            .arg("node")
+            .args(record.iter().flat_map(|folder| [Path::new("--record"), folder]))
+            .arg("--ros-args")
             .args(arguments)
             .env("ROS_DOMAIN_ID", domain.to_string())
             .env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -94,12 +102,17 @@ fn bag(name: &str) -> String {
     format!("{}/bags/{name}/{name}.mcap", env!("CARGO_MANIFEST_DIR"))
 }
 
-/// What a replay finds: the likely edges by child, parent and type, and the intervals of their numbers.
+/// What a replay of a bag of this repository finds.
 fn replayed(name: &str, root: &str) -> (BTreeMap<String, Value>, Value) {
+    replayed_bag(Path::new(&bag(name)), root)
+}
+
+/// What a replay finds: the likely edges by child, parent and type, and the intervals of their numbers.
+fn replayed_bag(bag: &Path, root: &str) -> (BTreeMap<String, Value>, Value) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("posterior.json");
     let status = Command::new(env!("CARGO_BIN_EXE_bom"))
-        .args(["replay", &bag(name), "--root-label", root, "--posterior", path.to_str().unwrap()])
+        .args(["replay", bag.to_str().unwrap(), "--root-label", root, "--posterior", path.to_str().unwrap()])
         .stdout(Stdio::null())
         .status()
         .unwrap();
@@ -267,4 +280,52 @@ fn another_vendor_is_heard_and_gets_what_is_latched() {
         "{description}"
     );
     assert!(bench.stop());
+}
+
+#[test]
+fn a_recording_has_what_was_taken_and_said_and_replays_to_the_same() {
+    let folder = tempfile::tempdir().unwrap();
+    let record = folder.path().join("run");
+    let arguments = ["-p", "root_label:=3", "-p", "publish_tf:=true", "-p", "tf_prefix:=seen/"];
+    let Some(bench) = Bench::start_recording(145, Some(&record), &arguments) else { return };
+    let seen = bench.peer(&["play", &bag("chain")]);
+    let note = format!("{seen:#}\n{}", bench.log());
+    assert_eq!(seen["settled"], true, "{note}");
+    assert!(bench.stop());
+    let (joints, posterior) = replayed_bag(&record, "3");
+    assert_eq!(seen["windows"], posterior["windows"].as_array().unwrap().len(), "{note}");
+    assert_eq!(seen["joints"], json!(joints), "{note}");
+    for edge in posterior["edges"].as_array().unwrap() {
+        let Some(medians) = seen["medians"].get(edge["child"].to_string()) else { continue };
+        if edge["probability"].as_f64().unwrap() <= 0.5 {
+            continue;
+        }
+        for (name, live) in ["damping", "friction", "joint_inertia"].iter().zip(medians.as_array().unwrap()) {
+            let (live, replayed) = (live.as_f64().unwrap(), edge[name]["median"].as_f64().unwrap());
+            assert!((live / replayed - 1.0).abs() < 1e-9, "{name}: live {live}, replayed {replayed}\n{note}");
+        }
+    }
+    let bag = Bag::open(&record).unwrap();
+    assert!(bag.damage().is_empty());
+    let counts: BTreeMap<String, usize> = bag.fold(BTreeMap::new(), |mut counts, message| {
+        *counts.entry(message.topic.name.clone()).or_default() += 1;
+        counts
+    });
+    // All that was published, whether the peer heard it or not.
+    assert!(counts["/bom/predicted_poses"] as u64 >= seen["predicted"].as_u64().unwrap(), "{counts:?}\n{note}");
+    for topic in ["/parts/points", "/wrench", "/tf", "/bom/object_posterior", "/bom/criticism", "/diagnostics"] {
+        assert!(counts[topic] > 1, "{topic}: {counts:?}\n{note}");
+    }
+    for topic in ["/bom/joint_states", "/bom/robot_description", "/bom/markers"] {
+        assert!(counts[topic] > 1, "{topic}: {counts:?}\n{note}");
+    }
+    let metadata = std::fs::read_to_string(record.join("metadata.yaml")).unwrap();
+    assert!(metadata.contains("- run_0.mcap"), "{metadata}");
+    // Rates go with joint states, and frames have their prefix.
+    assert!(seen["fastest"].as_f64().unwrap() > 0.02, "{note}");
+    assert!(
+        seen["tf"].as_array().unwrap().iter().all(|name| name.as_str().unwrap().starts_with("seen/part_")),
+        "{note}"
+    );
+    assert!(!seen["tf"].as_array().unwrap().is_empty(), "{note}");
 }

@@ -49,14 +49,14 @@ fn live(lag: usize) -> (ObjectPosterior, Vec<f64>) {
     for (at, input) in inputs().into_iter().enumerate() {
         take(pipeline.push(input), &mut waiting, at);
         while let Some((_, window)) = waiting.pop_front_if(|(due, _)| *due <= at) {
-            let result = worker.learn(&window);
+            let result = worker.learn(*window);
             pipeline.adopt(&result);
             learned = Some(result.posterior);
         }
     }
     take(pipeline.finish(), &mut waiting, 0);
     for (_, window) in waiting {
-        let result = worker.learn(&window);
+        let result = worker.learn(*window);
         pipeline.adopt(&result);
         learned = Some(result.posterior);
     }

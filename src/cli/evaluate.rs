@@ -59,8 +59,8 @@ pub fn run(arguments: &EvaluateArguments) -> anyhow::Result<()> {
     drop(progress);
 
     let counters = ingest.counters().clone().with_damage(bag.damage());
-    if counters.clouds_in == 0 {
-        bail!("{bag_name}: no cloud could be used");
+    if counters.clouds_in + counters.poses_in == 0 {
+        bail!("{bag_name}: no cloud and no pose could be used");
     }
     let scores = pipeline.scores().cloned().unwrap_or_default();
     let evaluation = Evaluation::new(&model_name, &bag_name, was_learned, horizon_s, &scores, counters);

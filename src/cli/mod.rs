@@ -52,7 +52,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
             // ROS has a level that tracing does not: it is the same to it.
             let level = ros.log_level.as_deref().map(|level| if level == "fatal" { "error" } else { level });
             start_logging(level.or(arguments.log_level.as_deref()), NODE_LOG)?;
-            node::run(&ros)
+            node::run(node, &ros)
         }
         Command::Import(import) => {
             start_logging(arguments.log_level.as_deref(), DEFAULT_LOG)?;

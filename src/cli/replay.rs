@@ -56,7 +56,8 @@ pub struct ReplayArguments {
     /// Seed of all random numbers, in place of the configuration's
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
-    /// Write what was read, as a bag: replaying it gives the same posterior
+    /// Write what was read, and what a node would have published of it, as a bag: replaying it gives the
+    /// same posterior
     #[arg(long, value_name = "OUT.mcap")]
     record: Option<PathBuf>,
     /// Write a report for people, one HTML file
@@ -85,7 +86,7 @@ pub fn run(arguments: &ReplayArguments) -> anyhow::Result<()> {
         bail!("{}: {missing}", arguments.bag.display());
     }
     // Opened before the work, so that a wrong path does not cost a run.
-    let mut outputs = Outputs::open(arguments)?;
+    let mut outputs = Outputs::open(arguments, &config.input.fixed_frame)?;
     let mut replay = Replay::new(arguments, &config)?;
     replay.read(&mut bag, &mut outputs)?;
 
@@ -124,7 +125,7 @@ struct Outputs {
 }
 
 impl Outputs {
-    fn open(arguments: &ReplayArguments) -> anyhow::Result<Self> {
+    fn open(arguments: &ReplayArguments, fixed_frame: &str) -> anyhow::Result<Self> {
         let create = |path: &Option<PathBuf>| path.as_deref().map(OutputFile::create).transpose();
         let table = |path: &Option<PathBuf>, with_horizon: bool| -> anyhow::Result<Option<OutputFile>> {
             let mut file = create(path)?;
@@ -139,7 +140,7 @@ impl Outputs {
             predictions: table(&arguments.predictions, true)?,
             report: create(&arguments.report)?,
             model: create(&arguments.save_model)?,
-            recording: arguments.record.as_deref().map(Recording::create).transpose()?,
+            recording: arguments.record.as_deref().map(|path| Recording::create(path, fixed_frame)).transpose()?,
         })
     }
 
@@ -203,7 +204,7 @@ struct Replay {
 impl Replay {
     fn new(arguments: &ReplayArguments, config: &Config) -> anyhow::Result<Self> {
         let mut settings = config.pipeline_settings(arguments.root_label.map(Label));
-        settings.predict = arguments.predictions.is_some() || arguments.report.is_some();
+        settings.predict = arguments.predictions.is_some() || arguments.report.is_some() || arguments.record.is_some();
         let mut root_is_given = arguments.root_label.is_some();
         let mut learned_bags = Vec::new();
         let pipeline = match &arguments.load_model {
@@ -273,6 +274,9 @@ impl Replay {
         let took = begin.elapsed();
         let learned = outputs.iter().filter(|output| matches!(output, Output::Learned { .. })).count();
         self.inference_wall.extend((0..learned).map(|_| took / learned as u32));
+        if let Some(recording) = &mut files.recording {
+            recording.say(&outputs, &self.pipeline, self.ingest.counters())?;
+        }
         outputs.iter().try_for_each(|output| self.take(output, files))
     }
 
@@ -303,7 +307,7 @@ impl Replay {
                 Outputs::write_row(&mut files.predictions, &row)?;
             }
             // A replay learns in the stream.
-            Output::WindowClosed(_) => {}
+            Output::FirstLook(_) | Output::WindowClosed(_) | Output::Tracked { .. } => {}
             Output::Learned { span_s } => tracing::info!(from_s = span_s.0, to_s = span_s.1, "window learned"),
             Output::Resumed { root, unexplained, unknown } => self.taken_up(*root, unexplained, unknown)?,
         }

@@ -20,7 +20,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::{Deserialize, Serialize};
 
 use crate::inference::Failure;
-use crate::model::{BatchWindow, DynamicsInput, DynamicsLearner, KinematicFit};
+use crate::model::{BatchWindow, DynamicsInput, DynamicsLearner, Hypothesis, KinematicFit};
 use crate::types::Label;
 use crate::types::posterior::{Criticism, Verdict};
 use rest::RestReadings;
@@ -40,8 +40,22 @@ pub struct Critic {
     findings: Option<Criticism>,
     adopted: bool,
     /// The joints that the last selection's numbers are about, and the numbers.
-    #[serde(skip)]
     known: Option<(Vec<Label>, Numbers)>,
+    /// The models on the way to the last selection.
+    stages: Vec<BTreeSet<Addition>>,
+}
+
+/// A model on the way from the declared physics to what was selected, fitted to all windows.
+#[derive(Clone, Debug)]
+pub struct Stage {
+    /// What it has beyond the declared physics, by joint; none for the sensor's.
+    pub effects: Vec<(Option<Label>, &'static str)>,
+    /// The model.
+    pub hypothesis: Hypothesis,
+    /// Its numbers.
+    pub x: Vec<f64>,
+    /// κ of a window, at the median.
+    pub noise_scale: f64,
 }
 
 impl Critic {
@@ -66,7 +80,7 @@ impl Critic {
             return Ok(0);
         }
         let rest = RestReadings::of(&batch, input, &SENSOR_SCALES);
-        let spans = input.windows.iter().filter_map(|w| Some([*w.times_s.first()?, *w.times_s.last()?])).collect();
+        let spans = spans_of(input);
         let rest_prior = rest.as_ref().and_then(RestReadings::posterior);
         let labels: Vec<Label> = fit.joints.iter().map(|joint| joint.child).collect();
         let (joints, sensor) = learner.numbers()?;
@@ -77,8 +91,7 @@ impl Critic {
         let (selected, findings, scales) = {
             let workshop =
                 Workshop { learner, fit, input, rest_prior: rest_prior.clone(), sensor_scales: SENSOR_SCALES, spans };
-            let found =
-                self.selection.as_ref().filter(|_| known_joints).map(|s| s.additions.clone()).unwrap_or_default();
+            let found = self.stages.last().filter(|_| known_joints).cloned().unwrap_or_default();
             let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref(), found: &found };
             let base = selector.base(&numbers)?;
             tracing::debug!(evidence = base.log_evidence, additions = ?base.additions, kappa = ?noise_scales(&base, &batch), "base");
@@ -137,7 +150,7 @@ impl Critic {
         let mut findings = findings;
         if found || self.adopted {
             let additions = if found { selected.additions.clone() } else { BTreeSet::new() };
-            let spans = input.windows.iter().filter_map(|w| Some([*w.times_s.first()?, *w.times_s.last()?])).collect();
+            let spans = spans_of(input);
             let hypothesis =
                 Workshop { learner, fit, input, rest_prior: rest_prior.clone(), sensor_scales: SENSOR_SCALES, spans }
                     .hypothesis(&additions)?;
@@ -151,10 +164,55 @@ impl Critic {
         }
         let steps = selected.steps;
         self.known = Some((labels, selected.numbers.clone()));
+        self.stages.clone_from(&selected.stages);
         self.findings = Some(findings);
         self.selection = Some(selected);
         Ok(steps)
     }
+}
+
+impl Critic {
+    /// The declared physics, and with it every model on the way to the last selection, each fitted anew to
+    /// all windows.
+    ///
+    /// # Errors
+    /// Where one of them cannot be fitted.
+    pub fn stages(
+        &self,
+        learner: &DynamicsLearner,
+        fit: &KinematicFit,
+        input: &DynamicsInput<'_>,
+    ) -> Result<Vec<Stage>, Failure> {
+        let batch = learner.batch(fit, input, MOST_WINDOWS);
+        let rest = RestReadings::of(&batch, input, &SENSOR_SCALES);
+        let rest_prior = rest.as_ref().and_then(RestReadings::posterior);
+        let (joints, sensor) = learner.numbers()?;
+        let labels: Vec<Label> = fit.joints.iter().map(|joint| joint.child).collect();
+        let known = self.known.as_ref().filter(|(of, _)| *of == labels).map(|(_, numbers)| numbers.clone());
+        let numbers = known.unwrap_or_else(|| Numbers { joints, sensor, added: BTreeMap::new() });
+        let workshop =
+            Workshop { learner, fit, input, rest_prior, sensor_scales: SENSOR_SCALES, spans: spans_of(input) };
+        let found = BTreeSet::new();
+        let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref(), found: &found };
+        let mut selections = vec![selector.base(&numbers)?];
+        for additions in &self.stages {
+            selections.push(selector.fitted(additions, &numbers, (12, 2))?);
+        }
+        let stage = |selection: Selection| {
+            let hypothesis = workshop.hypothesis(&selection.additions)?;
+            let named = selection.additions.iter().filter(|a| !matches!(a, Addition::Stop(..)));
+            let effects = named.map(|a| (a.joint().map(|joint| fit.joints[joint].child), a.name())).collect();
+            let x = selection.numbers.laid_out(&hypothesis, &selection.additions);
+            let scales = noise_scales(&selection, &batch).into_iter().map(|(_, scale)| scale).collect();
+            Ok(Stage { effects, hypothesis, x, noise_scale: crate::math::median(scales).unwrap_or(1.0) })
+        };
+        selections.into_iter().map(stage).collect()
+    }
+}
+
+/// Beginning and end of each window \[s\].
+fn spans_of(input: &DynamicsInput<'_>) -> Vec<[f64; 2]> {
+    input.windows.iter().filter_map(|w| Some([*w.times_s.first()?, *w.times_s.last()?])).collect()
 }
 
 /// κ by window.
@@ -170,18 +228,21 @@ fn noise_scales(selection: &Selection, batch: &[BatchWindow]) -> Vec<(usize, f64
     scales
 }
 
-/// κ of a window that a model does not come near.
-const OUTLYING: f64 = 1e4;
+/// κ of a window that a model does not come near, at least and in units of the usual one.
+const OUTLYING: (f64, f64) = (1e4, 30.0);
 
 /// Places in the batch of the windows that the selected model does not come near, where most are explained.
 fn outlying(selection: &Selection) -> Vec<usize> {
     let mut far = Vec::new();
     let mut all = 0;
+    let scales = selection.components.iter().filter_map(|c| c.fitted.as_ref()).flat_map(|f| &f.windows);
+    let usual = crate::math::median(scales.map(|window| window.noise_scale).collect()).unwrap_or(1.0);
+    let least = OUTLYING.0.max(OUTLYING.1 * usual);
     for component in &selection.components {
         let Some(fitted) = &component.fitted else { continue };
         all += component.windows.len();
         let own = component.windows.iter().zip(&fitted.windows);
-        far.extend(own.filter(|(_, window)| window.noise_scale >= OUTLYING).map(|(w, _)| *w));
+        far.extend(own.filter(|(_, window)| window.noise_scale >= least).map(|(w, _)| *w));
     }
     if 3 * far.len() <= all { far } else { Vec::new() }
 }

@@ -2,15 +2,18 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use serde::{Deserialize, Serialize};
+
 use crate::inference::{Failure, Gaussian};
 use crate::mechanism::effects::{EffectKind, TableKind};
 use crate::model::{
     AddedTable, DynamicsInput, DynamicsLearner, FRICTION, Hypothesis, JointScales, KinematicFit, LIMIT_DEVIATION,
     LOWER, SENSOR_SIZE, SIZE, UPPER,
 };
+use crate::types::pairs;
 
 /// One effect beyond the declared model; joints by index in the fit.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum Addition {
     /// An end stop, lower or upper: part of the declared physics, once it is reached.
     Stop(usize, bool),
@@ -52,13 +55,14 @@ impl Addition {
 }
 
 /// All numbers of a model by what they are about: they outlive changes of the layout.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Numbers {
     /// The declared numbers of each joint.
     pub joints: Vec<Vec<f64>>,
     /// The sensor's.
     pub sensor: Vec<f64>,
     /// Those of additions.
+    #[serde(with = "pairs")]
     pub added: BTreeMap<Addition, Vec<f64>>,
 }
 

@@ -14,6 +14,8 @@ use crate::model::{BatchWindow, Hypothesis, WindowResidual};
 use crate::types::Label;
 use crate::types::posterior::ResidualScore;
 
+/// Positions are simulated this far \[s\].
+const HORIZON_S: f64 = 1.0;
 /// Lags that whiteness is tested over.
 const LAGS: usize = 10;
 
@@ -90,7 +92,7 @@ fn sequence(
         let best = fits.into_iter().flatten().max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence));
         let fresh = best.ok_or(Failure::Diverged)?;
         let log_density = fresh.log_evidence - 0.5 * fresh.windows[0].observations as f64 * std::f64::consts::TAU.ln();
-        let residual = hypothesis.window(window, usual).residual(&x)?;
+        let residual = hypothesis.window(window, usual).residual(&x, HORIZON_S)?;
         scored.push(Scored { window: w, log_density, residual });
     }
     Ok(scored)

@@ -26,15 +26,35 @@ const PLACES: f64 = 150.0;
 /// κ from which on a window is not explained, and how many tables are then tried in any case.
 const MISFIT: f64 = 10.0;
 const TABLES_TRIED: usize = 4;
+/// A joint that goes less than a fifth of its usual way in this span has halted \[s\].
+const HALT_S: f64 = 0.2;
 /// Rank of what was found before.
 const KNOWN: f64 = 1e9;
 /// A delay is tried from these \[scales\]: the motion's dependence on it is far from linear.
 const DELAYS: [f64; 4] = [-0.8, 0.3, 1.0, 2.0];
-/// A review ends at this many linearizations of a window; one in which several joints move counts for
-/// the square of their number and as much again.
+/// A review ends at this many linearizations of a window beyond the base model's; one in which several
+/// joints move counts for the square of their number and as much again.
 const BUDGET: usize = 1500;
+/// The same where several joints move.
+const CHAIN_BUDGET: usize = 2500;
 /// Linearizations of a refit, and how often κ is chosen anew.
 const REFIT: (usize, usize) = (8, 2);
+/// Where several joints move, candidates are first fitted as little as this, and the best few refitted.
+const GLANCE: (usize, usize) = (4, 1);
+/// A window that needs this much process noise is far from explained: what is lacking shows little at first
+/// order, and is sought from far away. So it is with innovations this much too large or too much alike.
+const FAR: f64 = 1e4;
+const FAR_REDUCTION: f64 = 10.0;
+/// κ to come from, then.
+const WIDEST: f64 = 1e5;
+/// What is tried in any case, then: the forces that change most of a motion.
+const PLAIN: [EffectKind; 4] =
+    [EffectKind::Spring, EffectKind::GravityOffset, EffectKind::SelfClosing, EffectKind::SoftClose];
+const REFITTED_OF_CHAINS: usize = 2;
+/// Friction that was not declared starts from these shares of a joint's usual force.
+const FRICTION_STARTS: [f64; 2] = [0.3, 0.1];
+/// What is part of something richer is added first if it explains this share of what that does.
+const SIMPLER_SHARE: f64 = 0.3;
 
 /// The model selected, with all that was compared on the way.
 #[derive(Clone, Debug)]
@@ -50,6 +70,10 @@ pub struct Selection {
     /// For every addition accepted: the log evidence of the model without it, and of those with
     /// another in its place.
     pub rivals: BTreeMap<Addition, Vec<(Option<Addition>, f64)>>,
+    /// The models on the way, by what they have beyond the declared physics.
+    pub stages: Vec<BTreeSet<Addition>>,
+    /// What was refitted last and gained too little, with its gain \[nats\].
+    pub declined: Vec<(Addition, f64)>,
     /// What tables would gain over the model at first order \[nats\], most first.
     pub leftover: Vec<(Addition, f64)>,
     /// Linearizations of all windows spent.
@@ -105,9 +129,12 @@ pub struct Selector<'a> {
 /// A refitted candidate.
 struct Trial {
     addition: Addition,
+    also: Vec<Addition>,
     /// All of its model.
     additions: BTreeSet<Addition>,
     gain: f64,
+    /// Linearizations spent, those from other starts too.
+    spent: usize,
     hypothesis: Hypothesis,
     fits: Vec<(Vec<usize>, BatchFit)>,
 }
@@ -120,10 +147,6 @@ impl Selector<'_> {
             several => 2 * several * several,
         };
         windows.iter().map(one).sum()
-    }
-
-    fn cost(&self, trial: &Trial) -> usize {
-        trial.fits.iter().map(|(windows, fitted)| fitted.steps * self.weight(windows)).sum()
     }
 
     fn windows(&self, places: &[usize]) -> Vec<&BatchWindow> {
@@ -145,6 +168,8 @@ impl Selector<'_> {
             components: components(self.batch, together),
             log_evidence: self.sensor_evidence(additions),
             rivals: BTreeMap::new(),
+            stages: Vec::new(),
+            declined: Vec::new(),
             leftover: Vec::new(),
             steps: 0,
         };
@@ -194,13 +219,15 @@ impl Selector<'_> {
                 let moved = component.windows.iter().any(|&w| self.batch[w].moving.contains(&joint));
                 for upper in [false, true].into_iter().filter(|_| moved) {
                     let stop = Addition::Stop(joint, upper);
-                    if declared.joints[joint].stops[usize::from(upper)] {
+                    if declared.joints[joint].stops[usize::from(upper)] || !self.may_halt(joint, upper) {
                         continue;
                     }
                     let (low, high) = self.workshop.range(joint);
                     let start = vec![if upper { high } else { low }];
-                    if let Ok(trial) = self.trial(&current, &Ranked { addition: stop, gain: 0.0, start }, (5, 1)) {
-                        current.steps += self.cost(&trial);
+                    if let Ok(trial) =
+                        self.trial(&current, &Ranked { addition: stop, gain: 0.0, start, also: Vec::new() }, (5, 1))
+                    {
+                        current.steps += trial.spent;
                         if trial.gain > STOP_GAIN {
                             self.take(&mut current, &trial);
                         }
@@ -215,32 +242,48 @@ impl Selector<'_> {
     pub fn select(&self, mut current: Selection) -> Result<Selection, Failure> {
         let declared = self.workshop.learner.declared_mechanism();
         let friction_declared = declared.joints.iter().all(|joint| joint.friction);
+        let budget = current.steps + self.budget();
         while current.rivals.len() < MOST * declared.joints.len().max(1) {
             let (ranked, leftover) = self.ranked(&current, friction_declared)?;
             current.leftover = leftover;
             let candidates = ranked.len().max(1) as f64;
             let mut trials: Vec<Trial> = Vec::new();
-            for candidate in self.shortlist(&ranked) {
-                if current.steps > BUDGET {
+            for candidate in self.shortlist(&current, &ranked) {
+                if current.steps > budget {
                     break;
                 }
                 if let Ok(trial) = self.best_trial(&current, &candidate) {
-                    current.steps += self.cost(&trial);
+                    current.steps += trial.spent;
                     tracing::debug!(addition = ?trial.addition, first_order = candidate.gain, gain = trial.gain, "trial");
                     trials.push(trial);
                 }
             }
-            trials.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.addition.cmp(&b.addition)));
+            let by_gain = |a: &Trial, b: &Trial| b.gain.total_cmp(&a.gain).then(a.addition.cmp(&b.addition));
+            trials.sort_by(by_gain);
+            if self.several() {
+                for trial in trials.iter_mut().take(REFITTED_OF_CHAINS) {
+                    let spent = self.refine(trial)?;
+                    current.steps += spent;
+                }
+                trials.sort_by(by_gain);
+            }
+            current.declined = trials.iter().map(|trial| (trial.addition, trial.gain)).collect();
             let least = LEAST_GAIN + candidates.ln();
             let needs = |trial: &Trial| match trial.addition {
                 Addition::Effect(_, EffectKind::Impulse) => least + PLACES.ln(),
                 _ => least,
             };
             let Some(best) = trials.iter().find(|trial| trial.gain > needs(trial)).or(trials.first()) else { break };
+            let part_of_it =
+                |trial: &&Trial| trial.gain > needs(trial).max(SIMPLER_SHARE * best.gain) && is_part_of(trial, best);
+            let best = trials.iter().find(part_of_it).unwrap_or(best);
             if best.gain < needs(best) {
                 // A right effect can gain nothing until its partner is in.
                 match self.pair(&current, best, friction_declared, least)? {
-                    Some(pair) => current = pair,
+                    Some(pair) => {
+                        current = pair;
+                        current.stages.push(current.additions.clone());
+                    }
                     None => break,
                 }
                 continue;
@@ -253,8 +296,10 @@ impl Selector<'_> {
             rivals.push((None, -best.gain));
             let addition = best.addition;
             self.take(&mut current, best);
+            current.rivals.extend(best.also.iter().map(|other| (*other, vec![(None, -best.gain)])));
             current.rivals.insert(addition, rivals);
             self.drop_what_is_not_needed(&mut current, addition)?;
+            current.stages.push(current.additions.clone());
         }
         Ok(current)
     }
@@ -274,7 +319,7 @@ impl Selector<'_> {
         self.take(&mut with_first, first);
         let (ranked, _) = self.ranked(&with_first, friction_declared)?;
         let candidates = ranked.len().max(1) as f64;
-        for candidate in self.shortlist(&ranked).into_iter().take(2) {
+        for candidate in self.shortlist(&with_first, &ranked).into_iter().take(2) {
             let Ok(second) = self.best_trial(&with_first, &candidate) else { continue };
             if first.gain + second.gain > least + candidates.ln() {
                 self.take(&mut with_first, &second);
@@ -288,24 +333,92 @@ impl Selector<'_> {
 
     /// The best of a candidate's starts, refitted.
     fn best_trial(&self, current: &Selection, candidate: &Ranked) -> Result<Trial, Failure> {
-        if candidate.addition != Addition::Delay {
-            return self.trial(current, candidate, REFIT);
-        }
+        let effort = if self.several() { GLANCE } else { REFIT };
+        let starts: Vec<Vec<f64>> = match candidate.addition {
+            Addition::Delay => DELAYS.map(|delay| vec![delay]).to_vec(),
+            // The numbers of a model without it stand in for it, and hold it down.
+            Addition::Friction(joint) => {
+                let force = self.workshop.learner.joint_scales(joint, self.workshop.fit).map_or(1.0, |s| s.force);
+                let levels = FRICTION_STARTS.map(|share| vec![(share * force).ln()]);
+                levels.to_vec()
+            }
+            _ if !self.is_far(current, candidate.addition.joint()) => return self.trial(current, candidate, effort),
+            _ => vec![candidate.start.clone(), Vec::new()],
+        };
         let mut bland = current.clone();
         bland.numbers.joints.clear();
-        let mut best: Option<(f64, Ranked, &Selection)> = None;
-        for from in [current, &bland] {
-            for delay in DELAYS {
-                let start = Ranked { start: vec![delay], ..candidate.clone() };
-                if let Ok(trial) = self.trial(from, &start, (4, 0))
-                    && best.as_ref().is_none_or(|(gain, _, _)| trial.gain > *gain)
-                {
-                    best = Some((trial.gain, start, from));
+        // A delay's numbers are far from linear; all else is either near what is known or not.
+        let both = candidate.addition == Addition::Delay;
+        let mut best: Option<Trial> = None;
+        let mut spent = 0;
+        for (from, near) in [(current, true), (&bland, false)] {
+            for (_, start) in starts.iter().enumerate().filter(|(i, _)| both || near == (*i == 0)) {
+                let start = Ranked { start: start.clone(), ..candidate.clone() };
+                let Ok(trial) = self.trial(from, &start, GLANCE) else { continue };
+                spent += trial.spent;
+                if best.as_ref().is_none_or(|other| trial.gain > other.gain) {
+                    best = Some(trial);
                 }
             }
         }
-        let (_, start, from) = best.ok_or(Failure::Diverged)?;
-        self.trial(from, &start, REFIT)
+        let mut best = best.ok_or(Failure::Diverged)?;
+        if !self.several() {
+            spent += self.refine(&mut best)?;
+        }
+        Ok(Trial { spent, ..best })
+    }
+
+    /// Whether a window that moves a joint, or any for the sensor, is far from explained.
+    fn is_far(&self, current: &Selection, joint: Option<usize>) -> bool {
+        let concerned = current.components.iter().filter(|c| joint.is_none_or(|joint| c.joints.contains(&joint)));
+        let mut windows = concerned.filter_map(|c| c.fitted.as_ref()).flat_map(|fitted| &fitted.windows);
+        windows.any(|window| window.noise_scale >= FAR || window.reduction > FAR_REDUCTION)
+    }
+
+    /// Whether several joints move in a window.
+    fn several(&self) -> bool {
+        self.batch.iter().any(|window| window.moving.len() > 1)
+    }
+
+    fn budget(&self) -> usize {
+        if self.several() { CHAIN_BUDGET } else { BUDGET }
+    }
+
+    /// Fits a trial on from where it is; returns what that cost.
+    fn refine(&self, trial: &mut Trial) -> Result<usize, Failure> {
+        let mut spent = 0;
+        for (places, fitted) in &mut trial.fits {
+            let scales: Vec<f64> = fitted.windows.iter().map(|window| window.noise_scale).collect();
+            let refined = trial.hypothesis.fit(&self.windows(places), &fitted.x, &scales, REFIT)?;
+            spent += refined.steps * self.weight(places);
+            if refined.log_evidence > fitted.log_evidence {
+                trial.gain += refined.log_evidence - fitted.log_evidence;
+                *fitted = refined;
+            }
+        }
+        Ok(spent)
+    }
+
+    /// Whether a joint was seen to stay at an end of its range: not if a record begins or ends there while
+    /// it moves.
+    fn may_halt(&self, joint: usize, upper: bool) -> bool {
+        let sign = if upper { 1.0 } else { -1.0 };
+        let fit = self.workshop.fit;
+        let near = 0.2 * self.workshop.learner.joint_scales(joint, fit).map_or(0.1, |scales| scales.rate) * HALT_S;
+        let mut farthest: Option<(f64, bool)> = None;
+        for (positions, window) in fit.positions.iter().zip(self.workshop.input.windows) {
+            let Some(path) = positions.get(joint) else { continue };
+            for (k, q) in path.iter().enumerate() {
+                if farthest.is_none_or(|(other, _)| sign * q > other) {
+                    let time_s = window.times_s[k];
+                    let about = |i: &usize| (window.times_s[*i] - time_s).abs() <= HALT_S;
+                    let ends = k == 0 || k + 1 == path.len();
+                    let moves = (0..path.len()).filter(about).any(|i| (path[i] - q).abs() > near);
+                    farthest = Some((sign * q, !(ends && moves)));
+                }
+            }
+        }
+        farthest.is_none_or(|(_, halts)| halts)
     }
 
     /// Everything that might be added, by joint, and what tables would gain.
@@ -333,7 +446,7 @@ impl Selector<'_> {
             let known = known.filter(|a| !current.additions.contains(a) && !matches!(a, Addition::Stop(..)));
             for addition in known.copied() {
                 let start = current.numbers.added.get(&addition).cloned().unwrap_or_default();
-                ranked.push(Ranked { addition, gain: KNOWN, start });
+                ranked.push(Ranked { addition, gain: KNOWN, start, also: Vec::new() });
             }
             for (k, &joint) in moved.iter().filter(|_| concerned).enumerate() {
                 let [own, sensor] = probes(self.workshop, &hypothesis, fitted, &windows, joint)?;
@@ -351,16 +464,25 @@ impl Selector<'_> {
             }
         }
         ranked.extend(of_sensor.into_values());
+        let joint_of = |candidate: &&Ranked| matches!(candidate.addition, Addition::Friction(_));
+        let mut frictions: Vec<Addition> = ranked.iter().filter(joint_of).map(|c| c.addition).collect();
+        frictions.sort_unstable();
+        frictions.dedup();
+        if let Some((addition, also)) = frictions.split_first().filter(|(_, also)| !also.is_empty()) {
+            ranked.push(Ranked { addition: *addition, gain: KNOWN, start: Vec::new(), also: also.to_vec() });
+        }
         // What was found before is tried from where it was, and anew.
         leftover.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
         Ok((ranked, leftover))
     }
 
     /// The best few of every joint, and the sensor's.
-    fn shortlist(&self, ranked: &[Ranked]) -> Vec<Ranked> {
-        let mut by_place: BTreeMap<Option<usize>, Vec<&Ranked>> = BTreeMap::new();
+    fn shortlist(&self, current: &Selection, ranked: &[Ranked]) -> Vec<Ranked> {
+        let mut by_place: BTreeMap<(bool, Option<usize>), Vec<&Ranked>> = BTreeMap::new();
         for candidate in ranked {
-            by_place.entry(candidate.addition.joint()).or_default().push(candidate);
+            // The sensor's last: they cost most.
+            let joint = candidate.addition.joint();
+            by_place.entry((joint.is_none(), joint)).or_default().push(candidate);
         }
         let mut shortlist: Vec<Ranked> = Vec::new();
         for mut candidates in by_place.into_values() {
@@ -370,10 +492,23 @@ impl Selector<'_> {
             };
             let worth = candidates.iter().filter(|c| c.gain > WORTH_A_REFIT || rest(c)).take(REFITTED);
             let mut worth: Vec<Ranked> = worth.map(|c| (*c).clone()).collect();
-            // What has more numbers ranks higher, but friction may be all that it finds.
+            // What has more numbers ranks higher, but friction or an offset may be all that it finds.
             let friction = |c: &Ranked| matches!(c.addition, Addition::Friction(_));
-            if !worth.iter().any(friction) {
-                worth.extend(candidates.iter().find(|c| friction(c)).map(|c| (*c).clone()));
+            let by_direction = |c: &Ranked| matches!(c.addition, Addition::Effect(_, EffectKind::AsymmetricFriction));
+            let offset = |c: &Ranked| matches!(c.addition, Addition::Effect(_, EffectKind::GravityOffset));
+            if !worth.iter().any(|c| friction(c) && c.also.is_empty()) {
+                worth.extend(candidates.iter().find(|c| friction(c) && c.also.is_empty()).map(|c| (*c).clone()));
+            }
+            if worth.iter().any(by_direction) && !worth.iter().any(offset) {
+                worth.extend(candidates.iter().find(|c| offset(c)).map(|c| (*c).clone()));
+            }
+            let far =
+                candidates.first().and_then(|c| c.addition.joint()).is_some_and(|j| self.is_far(current, Some(j)));
+            for kind in PLAIN.iter().filter(|_| far) {
+                let own = |c: &Ranked| matches!(c.addition, Addition::Effect(_, own) if own == *kind);
+                if !worth.iter().any(own) {
+                    worth.extend(candidates.iter().find(|c| own(c)).map(|c| (*c).clone()));
+                }
             }
             shortlist.append(&mut worth);
         }
@@ -385,6 +520,7 @@ impl Selector<'_> {
         let addition = candidate.addition;
         let mut additions = current.additions.clone();
         additions.insert(addition);
+        additions.extend(&candidate.also);
         // What pulls towards the closed position leans on its stop, which shows only now.
         let stop = self.closed_stop(addition).filter(|stop| additions.insert(*stop));
         let hypothesis = self.workshop.hypothesis(&additions)?;
@@ -393,8 +529,12 @@ impl Selector<'_> {
         if let Addition::Effect(joint, kind @ EffectKind::AsymmetricFriction) = addition
             && let Some(effect) = hypothesis.mechanism.joints[joint].effects.last()
             && !numbers.joints.is_empty()
+            && !start.is_empty()
         {
             start = start_by_direction(&numbers.joints[joint], &start, kind, &effect.scales);
+        }
+        for other in &candidate.also {
+            numbers.added.insert(*other, start.clone());
         }
         numbers.added.insert(addition, start);
         if let Some(Addition::Stop(joint, upper)) = stop {
@@ -415,11 +555,13 @@ impl Selector<'_> {
                 c.fitted.as_ref().map(|f| f.windows[at].noise_scale)
             })
         };
-        let scales: Vec<f64> = places.iter().map(|w| scale(w).unwrap_or(10.0)).collect();
+        let far = effort == GLANCE && self.is_far(current, addition.joint());
+        let scales: Vec<f64> = places.iter().map(|w| if far { WIDEST } else { scale(w).unwrap_or(10.0) }).collect();
         let fitted = hypothesis.fit(&self.windows(&places), &x, &scales, effort)?;
         let rest = self.sensor_evidence(&additions) - self.sensor_evidence(&current.additions);
         let gain = fitted.log_evidence - before + rest;
-        Ok(Trial { addition, additions, gain, hypothesis, fits: vec![(places, fitted)] })
+        let (also, spent) = (candidate.also.clone(), fitted.steps * self.weight(&places));
+        Ok(Trial { addition, also, additions, gain, spent, hypothesis, fits: vec![(places, fitted)] })
     }
 
     /// The stop at the closed end, if the effect pulls there or holds, and the joint was there.
@@ -462,7 +604,11 @@ impl Selector<'_> {
             }
         }
         current.log_evidence += trial.gain;
-        // Layouts have changed for the others: their fits are carried over by name.
+        self.lay_out(current);
+    }
+
+    /// Layouts have changed: fits are carried over by name.
+    fn lay_out(&self, current: &mut Selection) {
         if let Ok(hypothesis) = self.workshop.hypothesis(&current.additions) {
             let x = current.numbers.laid_out(&hypothesis, &current.additions);
             for component in &mut current.components {
@@ -490,6 +636,16 @@ impl Selector<'_> {
         {
             let mut fewer = current.additions.clone();
             fewer.remove(&addition);
+            if let (Addition::Friction(joint), Addition::Effect(other, EffectKind::AsymmetricFriction)) =
+                (addition, newest)
+                && joint == other
+            {
+                // It stands in its place: nothing depends on it any more.
+                current.additions = fewer;
+                current.rivals.remove(&addition);
+                self.lay_out(current);
+                continue;
+            }
             let without = self.fitted(&fewer, &current.numbers, (6, 1))?;
             current.steps += without.steps;
             tracing::debug!(?addition, loss = current.log_evidence - without.log_evidence, "without");
@@ -500,9 +656,11 @@ impl Selector<'_> {
                 _ => LEAST_GAIN,
             };
             if without.log_evidence > current.log_evidence - least {
-                let (mut rivals, steps) = (std::mem::take(&mut current.rivals), current.steps);
+                let mut rivals = std::mem::take(&mut current.rivals);
                 rivals.remove(&addition);
-                *current = Selection { rivals, steps, ..without };
+                let (stages, declined) = (std::mem::take(&mut current.stages), std::mem::take(&mut current.declined));
+                let leftover = std::mem::take(&mut current.leftover);
+                *current = Selection { rivals, stages, declined, leftover, steps: current.steps, ..without };
             }
         }
         Ok(())
@@ -534,22 +692,23 @@ impl Selector<'_> {
     pub fn describe_leftover(&self, mut current: Selection) -> Result<Selection, Failure> {
         let leftover = current.leftover.clone();
         tracing::debug!(?leftover, "leftover");
+        let budget = current.steps + self.budget() / 2;
         let mut best: BTreeMap<usize, (f64, Trial)> = BTreeMap::new();
         let mut tried: BTreeMap<usize, usize> = BTreeMap::new();
         for (addition, gain) in leftover {
             let Some(joint) = addition.joint() else { continue };
             // Where κ is large nothing gains much at first order.
             let count = tried.entry(joint).or_default();
-            if current.steps > BUDGET
+            if current.steps > budget
                 || *count >= TABLES_TRIED
                 || (gain < LEAST_TABLE_GAIN && !misfits(&current, joint))
             {
                 continue;
             }
             *count += 1;
-            let trial = self.trial(&current, &Ranked { addition, gain, start: Vec::new() }, REFIT);
+            let trial = self.trial(&current, &Ranked { addition, gain, start: Vec::new(), also: Vec::new() }, REFIT);
             let Ok(trial) = trial else { continue };
-            current.steps += self.cost(&trial);
+            current.steps += trial.spent;
             tracing::debug!(?addition, gain, refitted = trial.gain, "table");
             if trial.gain > LEAST_TABLE_GAIN && best.get(&joint).is_none_or(|(other, _)| trial.gain > *other) {
                 best.insert(joint, (trial.gain, trial));
@@ -558,10 +717,11 @@ impl Selector<'_> {
         for (gain, trial) in best.into_values() {
             // The layout may have changed since.
             let addition = trial.addition;
-            let trial = self.trial(&current, &Ranked { addition, gain, start: Vec::new() }, REFIT)?;
+            let trial = self.trial(&current, &Ranked { addition, gain, start: Vec::new(), also: Vec::new() }, REFIT)?;
             self.take(&mut current, &trial);
             current.rivals.insert(addition, vec![(None, -trial.gain)]);
             self.drop_what_is_not_needed(&mut current, addition)?;
+            current.stages.push(current.additions.clone());
         }
         Ok(current)
     }
@@ -571,6 +731,19 @@ impl Selector<'_> {
 fn misfits(current: &Selection, joint: usize) -> bool {
     let concerned = current.components.iter().filter(|c| c.joints.contains(&joint));
     concerned.filter_map(|c| c.fitted.as_ref()).flat_map(|f| &f.windows).any(|w| w.noise_scale >= MISFIT)
+}
+
+/// Whether a trial is the simpler one of two of which the other has all that it has: friction in all that
+/// resists motion, an offset in friction by direction.
+fn is_part_of(simple: &Trial, rich: &Trial) -> bool {
+    match (simple.addition, rich.addition) {
+        (Addition::Friction(_), Addition::Friction(_)) => false,
+        (Addition::Friction(joint), other) => other.joint() == Some(joint) || !simple.also.is_empty(),
+        (Addition::Effect(joint, EffectKind::GravityOffset), Addition::Effect(other, kind)) => {
+            joint == other && kind == EffectKind::AsymmetricFriction
+        }
+        _ => false,
+    }
 }
 
 /// Whether two additions compete to explain the same.

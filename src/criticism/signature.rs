@@ -28,6 +28,8 @@ pub struct Ranked {
     pub gain: f64,
     /// Its numbers to start a fit from.
     pub start: Vec<f64>,
+    /// What comes with it: friction on the other joints, where it is declared on none.
+    pub also: Vec<Addition>,
 }
 
 /// Normal equations of probes on one joint, or of the sensor's errors, the model eliminated.
@@ -291,7 +293,7 @@ impl Probes {
             let signature = self.friction(|_| 1.0);
             if let Some((gain, _)) = self.regress(&[signature]) {
                 let start = vec![(0.2 * scales.force).ln()];
-                ranked.push(Ranked { addition: Addition::Friction(joint), gain, start });
+                ranked.push(Ranked { addition: Addition::Friction(joint), gain, start, also: Vec::new() });
             }
         }
         for kind in EffectKind::ALL {
@@ -304,7 +306,7 @@ impl Probes {
                 let laws = kind.parameters().iter().zip(&physical);
                 let start =
                     laws.map(|(p, value)| p.unconstrained(*value, &scales).unwrap_or(-2.0).clamp(-2.5, 2.5)).collect();
-                ranked.push(Ranked { addition, gain, start });
+                ranked.push(Ranked { addition, gain, start, also: Vec::new() });
             }
         }
         ranked
@@ -325,7 +327,7 @@ impl Probes {
                 .collect();
             if let Some((gain, amplitudes)) = self.regress(&signatures) {
                 let start = amplitudes.iter().map(|a| a.clamp(-2.0, 2.0)).collect();
-                ranked.push(Ranked { addition, gain, start });
+                ranked.push(Ranked { addition, gain, start, also: Vec::new() });
             }
         }
         ranked

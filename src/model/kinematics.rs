@@ -14,7 +14,7 @@ use std::rc::Rc;
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
 use serde::{Deserialize, Serialize};
 
-use super::window::{Contact, PoseMeasurement, WindowObservations};
+use super::window::{Contact, PoseMeasurement, WindowObservations, with_shared_error};
 use crate::math::{Pose, Screw, orthonormal_pair};
 use crate::mechanism::JointType;
 use crate::types::Label;
@@ -390,13 +390,7 @@ impl<'a> Problem<'a> {
             if self.references[j].is_some() {
                 return Some(raw);
             }
-            let scale = Vector6::new(joint.radius, joint.radius, joint.radius, 1.0, 1.0, 1.0);
-            let scaled = Matrix6::from_fn(|i, j| raw[(i, j)] / (scale[i] * scale[j]));
-            let mut eigen = scaled.symmetric_eigen();
-            let shared = sharing(w, j, frame) * self.settings.shared_error.powi(2);
-            eigen.eigenvalues.apply(|x| *x = if *x > 0.0 { 1.0 / (1.0 / *x + shared) } else { 0.0 });
-            let clean = eigen.recompose();
-            Some(Matrix6::from_fn(|i, j| clean[(i, j)] * scale[i] * scale[j]))
+            with_shared_error(&raw, joint.radius, sharing(w, j, frame) * self.settings.shared_error.powi(2))
         };
         (0..self.windows.len())
             .map(|w| {
@@ -714,23 +708,31 @@ impl<'a> Problem<'a> {
 
     /// Counts, for every frame, the frames of its part within `shared_distance` of it.
     fn share_errors(&mut self) {
-        let mut sharing: BTreeMap<(usize, usize, usize), f64> = BTreeMap::new();
+        let mut sharing: Vec<Vec<Vec<f64>>> =
+            self.windows.iter().map(|window| vec![vec![1.0; window.times_s.len()]; self.joints.len()]).collect();
         // What a pose topic measures shares no registration error.
         for j in (0..self.joints.len()).filter(|&j| self.references[j].is_none()) {
-            let mut looks = Vec::new();
+            // Frames that follow each other at one place count together.
+            let mut looks: Vec<(Look, Vec<(usize, usize)>)> = Vec::new();
             for (w, window) in self.windows.iter().enumerate() {
                 for frame in 0..window.times_s.len() {
                     let displacement = forward(&self.joints, |i| self.positions[w][i][frame])[j];
-                    looks.push((w, frame, Look::at(&self.joints[j], &displacement)));
+                    let look = Look::at(&self.joints[j], &displacement);
+                    match looks.last_mut() {
+                        Some((last, frames)) if *last == look => frames.push((w, frame)),
+                        _ => looks.push((look, vec![(w, frame)])),
+                    }
                 }
             }
-            for (w, frame, look) in &looks {
-                let near = looks.iter().filter(|(.., l)| look.distance(l) < self.settings.shared_distance).count();
-                sharing.insert((*w, j, *frame), near as f64);
+            for (look, frames) in &looks {
+                let near = looks.iter().filter(|(other, _)| look.distance(other) < self.settings.shared_distance);
+                let count: usize = near.map(|(_, frames)| frames.len()).sum();
+                for &(w, frame) in frames {
+                    sharing[w][j][frame] = count as f64;
+                }
             }
         }
-        self.information =
-            Rc::new(self.informations(|w, j, frame| sharing.get(&(w, j, frame)).copied().unwrap_or(1.0)));
+        self.information = Rc::new(self.informations(|w, j, frame| sharing[w][j][frame]));
     }
 
     /// Frees joints that were taken to rest through a window where the data object: a score test on
@@ -925,6 +927,7 @@ fn window_information(matrix: &DMatrix<f64>, systems: &[WindowSystem]) -> Vec<f6
 }
 
 /// Where a part is seen \[m\]: looks at one pose share their registration error.
+#[derive(PartialEq)]
 struct Look {
     place: Vector3<f64>,
     rotated: Vector3<f64>,

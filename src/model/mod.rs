@@ -8,8 +8,8 @@ mod window;
 pub use dynamics::{
     AddedEffect, AddedTable, BatchFit, BatchWindow, BatchedWindow, DAMPING, DeclaredPhysics, DynamicsInput,
     DynamicsLearner, DynamicsPosterior, FRICTION, Hypothesis, INERTIA, JointDynamics, JointModel, JointScales,
-    LIMIT_DEVIATION, LOWER, Mechanism, PartDynamics, SENSOR_SIZE, SIZE, SamplingReport, SensorModel, UPPER,
-    WindowInference, WindowModel, WindowResidual,
+    LIMIT_DEVIATION, LOWER, Mechanism, PartDynamics, SENSOR_SIZE, SIZE, SamplingReport, SensorError, SensorModel,
+    UPPER, WindowInference, WindowModel, WindowResidual,
 };
 pub use edges::{
     EdgeFit, EdgePart, axes_from_motion, moving_evidence, nearest_position, relative_windows, rigid_evidence,

@@ -98,3 +98,14 @@ impl WindowObservations {
         (own.displacement == *place && own.rotation_is_measured()).then_some(own)
     }
 }
+
+/// Information of a pose with an error of this variance \[m²\] that other measurements have too; rotations
+/// count by `radius` \[m\]. `None` where it is not positive semidefinite.
+pub fn with_shared_error(information: &Matrix6<f64>, radius: f64, variance: f64) -> Option<Matrix6<f64>> {
+    let scale = Vector6::new(radius, radius, radius, 1.0, 1.0, 1.0);
+    let scaled = Matrix6::from_fn(|i, j| information[(i, j)] / (scale[i] * scale[j]));
+    // (Λ⁻¹ + s I)⁻¹ = (I + s Λ)⁻¹ Λ, which stands where Λ is singular.
+    let shared = (Matrix6::identity() + scaled * variance).cholesky()?.solve(&scaled);
+    let even = (shared + shared.transpose()) * 0.5;
+    Some(Matrix6::from_fn(|i, j| even[(i, j)] * scale[i] * scale[j]))
+}

@@ -136,6 +136,7 @@ fn tracking_values(health: &Health) -> Vec<KeyValue> {
         ("cloud to prediction sent", &health.latency),
         ("tracking of a cloud", &health.tracking),
         ("tracking of a cloud on the processor", &health.processor),
+        ("adoption on the processor", &health.adoption),
     ];
     for (name, times) in all {
         let [median, most, longest] = times.quantiles([0.5, 0.99, 1.0]);

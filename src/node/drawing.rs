@@ -1,6 +1,6 @@
 //! Robot description and markers, made beside the stream: hulls and meshes take their time.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::mpsc::{self, Receiver, Sender};
@@ -25,6 +25,8 @@ pub struct Model {
     pub posterior: ObjectPosterior,
     /// Its likeliest tree.
     pub tree: LinkTree,
+    /// Parts that float in it.
+    pub floating: BTreeSet<Label>,
     /// Hulls of the parts, world at the first frame.
     pub hulls: BTreeMap<Label, HullProperties>,
     /// Least and greatest position of each joint seen \[m or rad\].

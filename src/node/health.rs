@@ -4,6 +4,8 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use rustix::time::{ClockId, clock_gettime};
+
 use super::inbox::Dropped;
 use super::lifecycle::State;
 use crate::io::counters::{ByReason, Counters};
@@ -120,6 +122,8 @@ pub struct Health {
     pub tracking: Times,
     /// Of that, on the processor \[s\].
     pub processor: Times,
+    /// Taking over what was learned, on the stream's processor \[s\].
+    pub adoption: Times,
     /// Learning.
     pub inference: Inference,
     /// Publishers and subscribers whose QoS does not fit, by topic.
@@ -158,6 +162,7 @@ impl SharedHealth {
             latency: Times::default(),
             tracking: Times::default(),
             processor: Times::default(),
+            adoption: Times::default(),
             inference: Inference::default(),
             incompatible: BTreeMap::new(),
             parameters,
@@ -183,10 +188,10 @@ pub fn now() -> Instant {
     Instant::now()
 }
 
-/// Time that this thread has had on a processor \[s\]; `None` where the system does not tell.
-pub fn processor_s() -> Option<f64> {
-    let schedule = std::fs::read_to_string("/proc/thread-self/schedstat").ok()?;
-    Some(schedule.split_whitespace().next()?.parse::<f64>().ok()? * 1e-9)
+/// Time that this thread has had on a processor \[s\].
+pub fn processor_s() -> f64 {
+    let time = clock_gettime(ClockId::ThreadCPUTime);
+    time.tv_sec as f64 + 1e-9 * time.tv_nsec as f64
 }
 
 impl Health {

@@ -1,23 +1,45 @@
-//! Windows wait here for their turn to be learned, beside the stream.
+//! What was seen waits here for its turn to be learned, beside the stream.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
 use anyhow::Context as _;
 use rayon::{ThreadPool, ThreadPoolBuilder};
+use thread_priority::{
+    NormalThreadSchedulePolicy, RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue,
+    ThreadSchedulePolicy, set_thread_priority_and_policy, thread_native_id, thread_schedule_policy,
+};
 
 use super::health::{SharedHealth, now};
-use crate::pipeline::{ClosedWindow, Learned, Worker};
+use crate::pipeline::{ClosedWindow, FirstLook, Learned, Looked, Worker};
 
 /// Windows that wait at most; one more, and the oldest that waits is dropped and counted.
 const MOST_WAITING: usize = 4;
 /// How much tracking goes before other programs and inference after them, in nice's steps.
 const NICENESS: (i32, i32) = (-10, 3);
+/// The latter, of 0 to 99.
+const NICE_PRIORITY: u8 = 40;
 
-/// A window, and which life of the pipeline it is from.
+/// What there is to learn.
+enum Work {
+    /// The object at rest.
+    Look(Arc<FirstLook>),
+    /// A window.
+    Window(Box<ClosedWindow>),
+}
+
+/// What was learned, for the stream to adopt.
+pub enum Taught {
+    /// Models of the parts.
+    Models(Looked),
+    /// What a window taught.
+    Window(Box<Learned>),
+}
+
+/// Work, and which life of the pipeline it is from.
 struct Job {
     life: u64,
-    window: Box<ClosedWindow>,
+    work: Work,
 }
 
 struct Queue {
@@ -33,14 +55,14 @@ pub struct Learning {
 }
 
 impl Learning {
-    /// Starts the thread. `learned` gets what every window taught, with its life.
+    /// Starts the thread. `learned` gets what everything taught, with its life.
     ///
     /// # Errors
     /// No threads.
     pub fn start(
         threads: usize,
         health: SharedHealth,
-        learned: impl Fn(u64, Box<Learned>) + Send + 'static,
+        learned: impl Fn(u64, Taught) + Send + 'static,
     ) -> anyhow::Result<Self> {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let threads = if threads == 0 { cores.saturating_sub(1).max(1) } else { threads };
@@ -64,17 +86,29 @@ impl Learning {
         self.queue.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// The object was seen at rest.
+    pub fn look(&self, life: u64, look: Arc<FirstLook>) {
+        self.lock().waiting.push_back(Job { life, work: Work::Look(look) });
+        self.queue.1.notify_one();
+    }
+
     /// A window closed. Returns those that too many waiting cost their turn.
     pub fn put(&self, life: u64, window: Box<ClosedWindow>) -> Vec<Box<ClosedWindow>> {
         let mut queue = self.lock();
-        queue.waiting.push_back(Job { life, window });
-        let over = queue.waiting.len().saturating_sub(MOST_WAITING);
-        let dropped: Vec<Box<ClosedWindow>> = queue.waiting.drain(..over).map(|job| job.window).collect();
-        let waiting = queue.waiting.len();
+        queue.waiting.push_back(Job { life, work: Work::Window(window) });
+        let is_window = |job: &Job| matches!(job.work, Work::Window(_));
+        let count = queue.waiting.iter().filter(|job| is_window(job)).count();
+        let mut dropped = Vec::new();
+        for _ in MOST_WAITING..count {
+            let oldest = queue.waiting.iter().position(is_window);
+            if let Some(Job { work: Work::Window(window), .. }) = oldest.and_then(|at| queue.waiting.remove(at)) {
+                dropped.push(window);
+            }
+        }
         drop(queue);
         self.queue.1.notify_one();
         let mut health = self.health.lock();
-        health.inference.waiting = waiting;
+        health.inference.waiting = count.min(MOST_WAITING);
         health.inference.superseded += dropped.len() as u64;
         dropped
     }
@@ -100,43 +134,77 @@ impl Learning {
         queue.waiting.pop_front()
     }
 
-    fn learn_all(&self, pool: &ThreadPool, learned: &impl Fn(u64, Box<Learned>)) {
+    fn learn_all(&self, pool: &ThreadPool, learned: &impl Fn(u64, Taught)) {
         give_way();
         let (mut worker, mut life, mut walls_s) = (Worker::default(), 0, Vec::new());
         while let Some(job) = self.next() {
             if job.life != life {
                 (worker, life, walls_s) = (Worker::default(), job.life, Vec::new());
             }
-            let begin = now();
-            {
-                let mut health = self.health.lock();
-                health.inference.since = Some(begin);
-                health.inference.waiting = self.lock().waiting.len();
+            match job.work {
+                Work::Look(look) => {
+                    let begin = now();
+                    let models = pool.install(|| worker.look(&look));
+                    tracing::info!("models of the parts made in {:.1} s", begin.elapsed().as_secs_f64());
+                    learned(life, Taught::Models(models));
+                }
+                Work::Window(window) => {
+                    learned(life, Taught::Window(self.learn(pool, &mut worker, *window, &mut walls_s)));
+                }
             }
-            let mut result = Box::new(pool.install(|| worker.learn(&job.window)));
-            let took_s = begin.elapsed().as_secs_f64();
-            walls_s.push(took_s);
-            for (record, wall_s) in result.posterior.windows.iter_mut().zip(&walls_s) {
-                record.inference_wall_s = *wall_s;
-            }
-            let mut health = self.health.lock();
-            health.inference.since = None;
-            health.inference.last_s = took_s;
-            health.inference.learned += 1;
-            drop(health);
-            let (from, to) = result.span_s;
-            tracing::info!("window of {from:.1} s to {to:.1} s learned in {took_s:.1} s");
-            learned(life, result);
         }
+    }
+
+    fn learn(
+        &self,
+        pool: &ThreadPool,
+        worker: &mut Worker,
+        window: ClosedWindow,
+        walls_s: &mut Vec<f64>,
+    ) -> Box<Learned> {
+        let begin = now();
+        let waiting = self.lock().waiting.len();
+        {
+            let mut health = self.health.lock();
+            health.inference.since = Some(begin);
+            health.inference.waiting = waiting;
+        }
+        let mut result = Box::new(pool.install(|| worker.learn(window)));
+        let took_s = begin.elapsed().as_secs_f64();
+        walls_s.push(took_s);
+        for (record, wall_s) in result.posterior.windows.iter_mut().zip(&*walls_s) {
+            record.inference_wall_s = *wall_s;
+        }
+        let mut health = self.health.lock();
+        health.inference.since = None;
+        health.inference.last_s = took_s;
+        health.inference.learned += 1;
+        drop(health);
+        let (from, to) = result.span_s;
+        tracing::info!("window of {from:.1} s to {to:.1} s learned in {took_s:.1} s");
+        result
     }
 }
 
-/// Threads begun by this one from now on go first. Few systems permit it to all: then nothing changes.
+/// Threads begun by this one from now on go first: in real time (SCHED_RR at its lowest priority, 1) where the
+/// system permits it, else by nice. Few systems permit that to all: then nothing changes. Nice alone does not
+/// do: it counts within a session only where sessions are scheduled as groups.
 pub fn go_first() {
-    let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS.0);
+    let realtime = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::RoundRobin);
+    if set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Min, realtime).is_err() {
+        let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS.0);
+    }
 }
 
 /// Lets the stream go first.
 pub fn give_way() {
+    if let (Ok(ThreadSchedulePolicy::Realtime(_)), Ok(priority)) =
+        (thread_schedule_policy(), ThreadPriorityValue::try_from(NICE_PRIORITY))
+    {
+        let normal = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Other);
+        let priority = ThreadPriority::Crossplatform(priority);
+        // It may always be given up.
+        let _ = set_thread_priority_and_policy(thread_native_id(), priority, normal);
+    }
     let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS.1);
 }

@@ -17,6 +17,7 @@ pub mod parameters;
 pub mod participant;
 pub mod planning;
 pub mod publications;
+pub mod recording;
 pub mod rosout;
 pub mod services;
 pub mod stream;
@@ -24,7 +25,7 @@ pub mod subscriptions;
 pub mod value;
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
 use anyhow::Context as _;
@@ -44,6 +45,7 @@ use names::Names;
 use parameters::Parameters;
 use participant::Participant;
 use publications::Publishers;
+use recording::Recording;
 use services::Managed;
 use stream::{Command, Stream};
 use subscriptions::Subscriptions;
@@ -55,18 +57,20 @@ pub const NAME: &str = "bom";
 /// Readings that wait for the stream at most: several seconds of them.
 const MOST_READINGS: usize = 20_000;
 
-/// Runs the node until it is shut down or told to stop.
+/// Runs the node until it is shut down or told to stop; records what it takes and says in a folder `record`.
 ///
 /// # Errors
-/// Names or parameters that make no node, or no network.
-pub fn run(arguments: &RosArguments) -> anyhow::Result<()> {
+/// Names or parameters that make no node, a folder that cannot be created, or no network.
+pub fn run(arguments: &RosArguments, record: Option<&Path>) -> anyhow::Result<()> {
     let names = Names::new(NAME, arguments)?;
     let mut parameters = Parameters::declared();
     let unusable = parameters.start_with(&arguments.overrides, &names);
-    learning::go_first();
+    if parameters.is("realtime") {
+        learning::go_first();
+    }
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().context("tokio")?;
-    runtime.block_on(live(&names, parameters, unusable, !arguments.rosout_disabled))
+    runtime.block_on(live(&names, parameters, unusable, (!arguments.rosout_disabled, record)))
 }
 
 /// The topics of the configuration as they are on the network.
@@ -80,7 +84,12 @@ fn resolved(input: &InputConfig, names: &Names) -> InputConfig {
     input
 }
 
-async fn live(names: &Names, parameters: Parameters, unusable: Vec<String>, rosout: bool) -> anyhow::Result<()> {
+async fn live(
+    names: &Names,
+    parameters: Parameters,
+    unusable: Vec<String>,
+    (rosout, record): (bool, Option<&Path>),
+) -> anyhow::Result<()> {
     let config = parameters.config().map_err(anyhow::Error::msg)?;
     let input = resolved(&config.input, names);
     let health = SharedHealth::new(unusable);
@@ -91,14 +100,17 @@ async fn live(names: &Names, parameters: Parameters, unusable: Vec<String>, roso
     }
     let publishers = Publishers::new(&mut participant, &parameters, health.clone())?;
     let mut endpoints = publishers.names.clone();
-    let outputs = publishers.start();
+    let recording = record.map(|folder| Recording::start(folder, names, health.clone())).transpose()?;
+    let recording_to = recording.as_ref().map(|(recording, _)| recording.clone());
+    let outputs = publishers.start(recording_to.clone());
     let adopt = Arc::clone(&inbox);
     let threads = parameters.number("worker_threads") as usize;
     let learning =
         Learning::start(threads, health.clone(), move |life, learned| adopt.tell(Command::Adopt(life, learned)))?;
     let meshes = parameters.get("mesh_folder").and_then(value::Value::as_text).filter(|folder| !folder.is_empty());
     let drawing = Drawing::start(outputs.clone(), meshes.map(PathBuf::from))?;
-    let stream = Stream::new(Arc::clone(&inbox), learning, (outputs.clone(), drawing), health.clone(), input.clone());
+    let said_to = (outputs.clone(), drawing, recording_to);
+    let stream = Stream::new(Arc::clone(&inbox), learning, said_to, health.clone(), input.clone());
     let thread =
         std::thread::Builder::new().name("stream".into()).spawn(|| stream.run()).context("the stream's thread")?;
     let mut subscriptions =
@@ -136,7 +148,14 @@ async fn live(names: &Names, parameters: Parameters, unusable: Vec<String>, roso
     }
     inbox.tell(Command::Stop);
     // It is at a cloud at most.
-    let _ = tokio::task::spawn_blocking(move || thread.join()).await;
+    let _ = tokio::task::spawn_blocking(move || {
+        let ended = thread.join();
+        if let Some((recording, thread)) = recording {
+            recording.end(thread);
+        }
+        ended
+    })
+    .await;
     Ok(())
 }
 

@@ -135,6 +135,13 @@ impl Parameters {
                 "Whether the parts' frames are sent on /tf, where they are and not only on ~/joint_states.",
             ),
             (
+                "tf_prefix",
+                Value::String(String::new()),
+                None,
+                Change::Always,
+                "What the names of the parts' frames on /tf begin with, as robot_state_publisher's frame_prefix.",
+            ),
+            (
                 "slowest_clouds_hz",
                 Value::Double(5.0),
                 Some((0.1, 100.0)),
@@ -154,6 +161,13 @@ impl Parameters {
                 None,
                 Change::AtStart,
                 "Folder, an absolute path, that the meshes of ~/robot_description are written to; empty: parts are boxes.",
+            ),
+            (
+                "realtime",
+                Value::Bool(true),
+                None,
+                Change::AtStart,
+                "Whether tracking goes before other programs, in real time where the system permits it.",
             ),
             (
                 "worker_threads",
@@ -246,6 +260,12 @@ impl Parameters {
     /// All names, in order.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.declared.keys().map(String::as_str)
+    }
+
+    /// What the parts' frames on /tf begin with; `None` if they are not sent.
+    pub fn tf_prefix(&self) -> Option<String> {
+        let prefix = self.get("tf_prefix").and_then(Value::as_text).unwrap_or_default();
+        self.is("publish_tf").then_some(prefix)
     }
 
     /// The part that is fixed to the world, if it is given.
@@ -381,7 +401,7 @@ fn checked(name: &str, declaration: &Declaration, value: &Value) -> Result<Value
 fn is_of_config(name: &str) -> bool {
     let live = ["root_label", "use_sim_time", "autostart", "publish_tf", "slowest_clouds_hz", "wrench_timeout_s"];
     !live.contains(&name)
-        && !["worker_threads", "mesh_folder"].contains(&name)
+        && !["worker_threads", "mesh_folder", "tf_prefix", "realtime"].contains(&name)
         && !name.starts_with("qos_overrides.")
         && !name.starts_with("input.wrenches.")
 }

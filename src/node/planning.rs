@@ -6,7 +6,7 @@ use ros2_interfaces_jazzy_serde::geometry_msgs::msg::Vector3 as VectorMessage;
 
 use super::stream::Ground;
 use crate::ros::messages::{PredictRequest, PredictResponse};
-use crate::ros::{FixedFrame, PartPrediction, predicted_poses};
+use crate::ros::{FixedFrame, PartPrediction, place_joints, predicted_poses};
 use crate::tracking::Plan;
 use crate::types::Label;
 
@@ -32,7 +32,7 @@ pub fn answer(ground: &Ground, request: &PredictRequest) -> anyhow::Result<Predi
         "{} poses, at most {MOST_POSES} fit into an answer: ask for a longer interval",
         poses.len()
     );
-    let predictions: Vec<PartPrediction> = poses
+    let mut predictions: Vec<PartPrediction> = poses
         .iter()
         .filter_map(|pose| {
             Some(PartPrediction {
@@ -41,9 +41,11 @@ pub fn answer(ground: &Ground, request: &PredictRequest) -> anyhow::Result<Predi
                 displacement: pose.displacement,
                 center_in_world: *ground.centers.get(&pose.label)?,
                 covariance_m2: pose.covariance_m2,
+                joint_position: None,
             })
         })
         .collect();
+    ground.tree.iter().for_each(|tree| place_joints(tree, &mut predictions));
     let frame = FixedFrame { name: ground.fixed_frame.clone(), zero: ground.stamp };
     Ok(PredictResponse {
         success: true,

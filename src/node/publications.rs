@@ -1,6 +1,7 @@
 //! What the node says, and how it gets onto the network: everything below 100 KB, or counted.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Instant;
 
 use ros2_client::Publisher;
@@ -15,11 +16,34 @@ use tokio::sync::mpsc;
 use super::health::{SharedHealth, now};
 use super::parameters::Parameters;
 use super::participant::{Participant, Quality};
+use super::recording::Recording;
 use crate::io::counters::Counters;
 use crate::ros::{MOST_BYTES, encoded_bytes, messages};
 
-/// Messages that wait for the network at most.
+/// Messages that wait for the network at most, of those that cannot wait and of the others.
 const MOST_WAITING: usize = 256;
+
+/// Names, as in the code, and types of what is published of the object.
+pub mod topics {
+    /// A topic's name and type.
+    pub type Topic = (&'static str, &'static str);
+    /// What is believed.
+    pub const OBJECT_POSTERIOR: Topic = ("~/object_posterior", "bayesian_object_models/msg/ObjectPosterior");
+    /// Where parts will be.
+    pub const PREDICTED_POSES: Topic = ("~/predicted_poses", "bayesian_object_models/msg/PredictedPartPoses");
+    /// What the model lacks.
+    pub const CRITICISM: Topic = ("~/criticism", "bayesian_object_models/msg/Criticism");
+    /// For people.
+    pub const MARKERS: Topic = ("~/markers", "visualization_msgs/msg/MarkerArray");
+    /// The likeliest model.
+    pub const ROBOT_DESCRIPTION: Topic = ("~/robot_description", "std_msgs/msg/String");
+    /// Where its joints are.
+    pub const JOINT_STATES: Topic = ("~/joint_states", "sensor_msgs/msg/JointState");
+    /// Frames of the parts.
+    pub const TF: Topic = ("/tf", "tf2_msgs/msg/TFMessage");
+    /// How the node does.
+    pub const DIAGNOSTICS: Topic = ("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray");
+}
 
 /// One message.
 #[derive(Clone, Debug)]
@@ -38,17 +62,30 @@ pub enum Publication {
     ParameterEvent(ParameterEvent),
 }
 
-/// Hands messages to the task that sends them; cheap to share.
+impl Publication {
+    /// Whether it goes with every cloud: it is small, and does not wait for what is large.
+    fn is_urgent(&self) -> bool {
+        matches!(self, Self::Predicted(..) | Self::JointStates(_) | Self::Tf(_))
+    }
+}
+
+/// Hands messages to the tasks that send them; cheap to share.
 #[derive(Clone)]
 pub struct Outputs {
-    sender: mpsc::Sender<Publication>,
+    urgent: mpsc::Sender<Publication>,
+    others: mpsc::Sender<Publication>,
+    recording: Option<Recording>,
     health: SharedHealth,
 }
 
 impl Outputs {
     /// Hands over a message; where too many wait it is dropped and counted.
     pub fn send(&self, publication: Publication) {
-        if self.sender.try_send(publication).is_err() {
+        if let Some(recording) = &self.recording {
+            recording.published(publication.clone());
+        }
+        let sender = if publication.is_urgent() { &self.urgent } else { &self.others };
+        if sender.try_send(publication).is_err() {
             Counters::add(&mut self.health.lock().unsent, "the network is behind", 1);
         }
     }
@@ -78,47 +115,52 @@ impl Publishers {
     /// A name that is none, or DDS.
     pub fn new(participant: &mut Participant, parameters: &Parameters, health: SharedHealth) -> anyhow::Result<Self> {
         let mut names = BTreeMap::new();
-        let own = |message: &str| format!("{}/msg/{message}", messages::PACKAGE);
         let quality = |topic: &str, latched| {
             let (reliable, depth) = parameters.qos(topic, false);
             Quality { reliable, latched, depth }
         };
         macro_rules! advertise {
-            ($name:expr, $type_name:expr, $quality:expr) => {{
-                let publisher = participant.advertise($name, &$type_name, $quality)?;
-                names.insert(publisher.guid(), participant.resolve($name));
+            ($topic:expr, $quality:expr) => {{
+                let (name, type_name) = $topic;
+                let publisher = participant.advertise(name, type_name, $quality)?;
+                names.insert(publisher.guid(), participant.resolve(name));
                 publisher
             }};
         }
-        let listed = |topic: &str| quality(topic, false);
-        let latched = |topic: &str| quality(topic, true);
+        let listed = |(topic, _): topics::Topic| quality(topic, false);
+        let latched = |(topic, _): topics::Topic| quality(topic, true);
         let fixed = |depth| Quality { reliable: true, latched: false, depth };
         Ok(Self {
-            posterior: advertise!("~/object_posterior", own("ObjectPosterior"), latched("~/object_posterior")),
-            predicted: advertise!("~/predicted_poses", own("PredictedPartPoses"), listed("~/predicted_poses")),
-            criticism: advertise!("~/criticism", own("Criticism"), latched("~/criticism")),
-            markers: advertise!("~/markers", "visualization_msgs/msg/MarkerArray", listed("~/markers")),
-            description: advertise!("~/robot_description", "std_msgs/msg/String", latched("~/robot_description")),
-            joint_states: advertise!("~/joint_states", "sensor_msgs/msg/JointState", listed("~/joint_states")),
-            tf: advertise!("/tf", "tf2_msgs/msg/TFMessage", fixed(100)),
-            diagnostics: advertise!("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", listed("/diagnostics")),
-            transitions: advertise!("~/transition_event", "lifecycle_msgs/msg/TransitionEvent", fixed(1)),
-            parameter_events: advertise!("/parameter_events", "rcl_interfaces/msg/ParameterEvent", fixed(1000)),
+            posterior: advertise!(topics::OBJECT_POSTERIOR, latched(topics::OBJECT_POSTERIOR)),
+            predicted: advertise!(topics::PREDICTED_POSES, listed(topics::PREDICTED_POSES)),
+            criticism: advertise!(topics::CRITICISM, latched(topics::CRITICISM)),
+            markers: advertise!(topics::MARKERS, listed(topics::MARKERS)),
+            description: advertise!(topics::ROBOT_DESCRIPTION, latched(topics::ROBOT_DESCRIPTION)),
+            joint_states: advertise!(topics::JOINT_STATES, listed(topics::JOINT_STATES)),
+            tf: advertise!(topics::TF, fixed(100)),
+            diagnostics: advertise!(topics::DIAGNOSTICS, listed(topics::DIAGNOSTICS)),
+            transitions: advertise!(("~/transition_event", "lifecycle_msgs/msg/TransitionEvent"), fixed(1)),
+            parameter_events: advertise!(("/parameter_events", "rcl_interfaces/msg/ParameterEvent"), fixed(1000)),
             health,
             names,
         })
     }
 
-    /// Starts the task that sends; it ends when nothing can be handed over any more.
-    pub fn start(self) -> Outputs {
-        let (sender, mut waiting) = mpsc::channel(MOST_WAITING);
+    /// Starts the tasks that send; they end when nothing can be handed over any more.
+    pub fn start(self, recording: Option<Recording>) -> Outputs {
         let health = self.health.clone();
-        tokio::spawn(async move {
-            while let Some(publication) = waiting.recv().await {
-                self.publish(publication).await;
-            }
+        let publishers = Arc::new(self);
+        let [urgent, others] = [(), ()].map(|()| {
+            let (sender, mut waiting) = mpsc::channel(MOST_WAITING);
+            let publishers = Arc::clone(&publishers);
+            tokio::spawn(async move {
+                while let Some(publication) = waiting.recv().await {
+                    publishers.publish(publication).await;
+                }
+            });
+            sender
         });
-        Outputs { sender, health }
+        Outputs { urgent, others, recording, health }
     }
 
     async fn publish(&self, publication: Publication) {

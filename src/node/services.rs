@@ -88,7 +88,7 @@ impl Managed {
                 (settings.predict, settings.live) = (true, true);
                 let input = with_topics(&config.input, &self.input);
                 self.inbox.tell(Command::Configure(Box::new((input, settings))));
-                self.inbox.tell(Command::PublishTf(parameters.is("publish_tf")));
+                self.inbox.tell(Command::PublishTf(parameters.tf_prefix()));
             }
             Transition::CleanUp => self.inbox.tell(Command::CleanUp),
             Transition::Activate => self.inbox.tell(Command::Activate),
@@ -151,7 +151,7 @@ impl Managed {
         if let Err(reason) = outcome {
             return SetParametersResult { successful: false, reason };
         }
-        self.inbox.tell(Command::PublishTf(self.parameters().is("publish_tf")));
+        self.inbox.tell(Command::PublishTf(self.parameters().tf_prefix()));
         let since = since_epoch();
         let mut event = ParameterEvent { node: self.name.clone(), ..ParameterEvent::default() };
         event.stamp.sec = i32::try_from(since.as_secs()).unwrap_or(i32::MAX);

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use nalgebra::Vector3;
+use nalgebra::{Vector3, Vector6};
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 
@@ -14,14 +14,15 @@ use super::announce::Announcer;
 use super::drawing::Drawing;
 use super::health::{SharedHealth, now, processor_s};
 use super::inbox::{Arrival, Inbox};
-use super::learning::Learning;
+use super::learning::{Learning, Taught};
 use super::publications::Outputs;
+use super::recording::Recording;
 use crate::io::config::InputConfig;
 use crate::io::ingest::{Ingest, Message};
 use crate::io::model_file::SavedModel;
 use crate::math::Pose;
-use crate::pipeline::{Learned, Output, Pipeline, PipelineSettings, Planner, Snapshot};
-use crate::ros::PartPrediction;
+use crate::pipeline::{Output, Pipeline, PipelineSettings, Planner, Snapshot};
+use crate::ros::{LinkTree, PartPrediction};
 use crate::types::{Input, Label, Stamp};
 
 /// How long the thread sleeps where nothing comes.
@@ -50,12 +51,12 @@ pub enum Command {
     /// What plans are answered from, with the transform from this frame into the fixed one, the stamp of
     /// now and the parts' centres.
     Planner(String, oneshot::Sender<Result<Box<Ground>, String>>),
-    /// A window was learned in this life of the pipeline.
-    Adopt(u64, Box<Learned>),
+    /// This was learned in this life of the pipeline.
+    Adopt(u64, Taught),
     /// The clock went back.
     BeginAgain,
-    /// Parts' frames go on /tf, or not.
-    PublishTf(bool),
+    /// Parts' frames go on /tf with this before their names, or not at all.
+    PublishTf(Option<String>),
     /// The end.
     Stop,
 }
@@ -72,12 +73,15 @@ pub struct Ground {
     pub fixed_frame: String,
     /// Centres of mass of the parts at the first frame \[m\].
     pub centers: BTreeMap<Label, Vector3<f64>>,
+    /// The tree of the description.
+    pub tree: Option<LinkTree>,
 }
 
 /// The state of the stream.
 pub struct Stream {
     inbox: Arc<Inbox<Command>>,
     learning: Learning,
+    recording: Option<Recording>,
     health: SharedHealth,
     ingest: Ingest,
     input: InputConfig,
@@ -104,13 +108,14 @@ impl Stream {
     pub fn new(
         inbox: Arc<Inbox<Command>>,
         learning: Learning,
-        (outputs, drawing): (Outputs, Drawing),
+        (outputs, drawing, recording): (Outputs, Drawing, Option<Recording>),
         health: SharedHealth,
         input: InputConfig,
     ) -> Self {
         Self {
             inbox,
             learning,
+            recording,
             announcer: Announcer::new(outputs, drawing, input.fixed_frame.clone()),
             health,
             ingest: Ingest::new(&input),
@@ -186,17 +191,24 @@ impl Stream {
             Command::Resume(model, reply) => {
                 let _ = reply.send(self.resume(*model));
             }
-            Command::Adopt(life, learned) if life == self.life => {
-                if let Some(pipeline) = &mut self.pipeline {
-                    pipeline.adopt(&learned);
-                    let counters = self.ingest.counters();
-                    self.announcer.learned(pipeline, &learned, counters, self.shift_ns);
-                }
-            }
+            Command::Adopt(life, taught) if life == self.life => self.adopt(taught),
             Command::Adopt(..) | Command::Stop => {}
             Command::BeginAgain => self.begin_again = true,
-            Command::PublishTf(on) => self.announcer.publish_tf(on),
+            Command::PublishTf(prefix) => self.announcer.publish_tf(prefix),
         }
+    }
+
+    fn adopt(&mut self, taught: Taught) {
+        let Some(pipeline) = &mut self.pipeline else { return };
+        let begin = processor_s();
+        match taught {
+            Taught::Models(models) => pipeline.adopt_models(&models),
+            Taught::Window(learned) => {
+                pipeline.adopt(&learned);
+                self.announcer.learned(pipeline, *learned, self.ingest.counters(), self.shift_ns);
+            }
+        }
+        self.health.lock().adoption.add(processor_s() - begin);
     }
 
     fn ground(&self, frame: &str) -> Result<Box<Ground>, String> {
@@ -208,8 +220,8 @@ impl Stream {
         let frame = if frame.is_empty() { &fixed_frame } else { frame };
         let world_from_frame =
             self.ingest.transforms().lookup(&fixed_frame, frame, stamp).map_err(|error| error.to_string())?;
-        let centers = self.announcer.centers();
-        Ok(Box::new(Ground { planner, world_from_frame, stamp, fixed_frame, centers }))
+        let (centers, tree) = (self.announcer.centers(), self.announcer.tree().cloned());
+        Ok(Box::new(Ground { planner, world_from_frame, stamp, fixed_frame, centers, tree }))
     }
 
     /// A pipeline that goes on from a saved model.
@@ -272,7 +284,10 @@ impl Stream {
             }
         }
         let is_cloud = matches!(arrival.message, Message::Cloud(_));
-        let (begin, begin_on_processor) = (now(), is_cloud.then(processor_s).flatten());
+        if let Some(recording) = &self.recording {
+            recording.accepted(&arrival.topic, &arrival.message);
+        }
+        let (begin, begin_on_processor) = (now(), processor_s());
         let inputs = self.ingest.push_message(&arrival.topic, arrival.message);
         let mut outputs = Vec::new();
         if let Some(pipeline) = self.pipeline.as_mut().filter(|_| self.active) {
@@ -287,10 +302,10 @@ impl Stream {
         }
         if is_cloud {
             let took_s = begin.elapsed().as_secs_f64();
-            let on_processor_s = processor_s().zip(begin_on_processor).map(|(end, begin)| end - begin);
+            let on_processor_s = processor_s() - begin_on_processor;
             let mut health = self.health.lock();
             health.tracking.add(took_s);
-            on_processor_s.into_iter().for_each(|time_s| health.processor.add(time_s));
+            health.processor.add(on_processor_s);
         }
     }
 
@@ -310,8 +325,10 @@ impl Stream {
                         displacement,
                         center_in_world,
                         covariance_m2,
+                        joint_position: None,
                     });
                 }
+                Output::FirstLook(look) => self.learning.look(self.life, look),
                 Output::WindowClosed(window) => {
                     let (from, to) = window.span_s();
                     info!("window of {from:.1} s to {to:.1} s closed");
@@ -321,8 +338,12 @@ impl Stream {
                     }
                 }
                 Output::Observation { time_s, label, measurement } => {
-                    self.announcer.observed(label, measurement.displacement);
+                    self.announcer.observed(label, measurement.displacement, Vector6::zeros());
                     observed = Some(Stamp(zero.plus_seconds(time_s).0 - self.shift_ns));
+                }
+                // It comes after what was observed, and knows more.
+                Output::Tracked { label, displacement, twist, .. } => {
+                    self.announcer.observed(label, displacement, twist);
                 }
                 Output::Resumed { root, unexplained, unknown } => {
                     info!(%root, "goes on with a saved object");
@@ -341,7 +362,7 @@ impl Stream {
             }
         }
         for (stamp, predictions) in predictions {
-            self.announcer.predicted(stamp, &predictions, self.arrivals.get(&stamp).copied());
+            self.announcer.predicted(stamp, predictions, self.arrivals.get(&stamp).copied());
         }
         if let (Some(stamp), Some(pipeline)) = (observed, &self.pipeline) {
             self.announcer.frame(pipeline, stamp, self.ingest.counters(), self.shift_ns);

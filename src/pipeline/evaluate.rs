@@ -1,32 +1,62 @@
-//! A saved object on a stream that it does not learn from: how far its predictions are off.
+//! A saved object on a stream that it does not learn from: what its models leave unexplained.
+//!
+//! Each window is measured with the axes as they were learned, and scored by the declared physics and by
+//! every model on criticism's way from there, all fitted to the same windows of the saved object: the
+//! residual force, and what simulation over one horizon from smoothed states is off by.
 
 use std::collections::BTreeMap;
 
+use nalgebra::Vector3;
+
 use super::explain::{explain_contacts, measure};
 use super::{Learner, Pipeline, PipelineSettings, ResumeError, SavedObject, WindowJob};
+use crate::criticism::Stage;
 use crate::math::Pose;
-use crate::mechanism::{JointType, WrenchSample};
-use crate::model::{PoseMeasurement, nearest_position};
+use crate::mechanism::JointType;
+use crate::model::{BatchWindow, DynamicsInput, PoseMeasurement, WindowObservations, WindowResidual, nearest_position};
 use crate::registration::AlignmentSettings;
-use crate::tracking::{MeasuredPath, ResidualSum, TrackedMechanism};
-use crate::types::Label;
+use crate::types::{Label, Stamp};
 
 /// Points further from the surface where it is expected say nothing \[m\].
 const GATE: f64 = 0.02;
-/// The wrench acts this long before and after the contact's frames \[s\]: half a frame.
-const CONTACT_MARGIN_S: f64 = 0.1;
-/// Readings around the contact between which the force comes and goes \[s\].
-const CONTACT_EDGE_S: f64 = 0.008;
 
-/// How far one part was off.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+/// Squares of one part's residuals under one model, summed over windows in which it moved.
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct PartScore {
-    /// Windows in which it moved or should have.
+    /// Windows in which it moved.
     pub windows: usize,
     /// Whether its joint turns: forces are in N·m then.
     pub turns: bool,
-    /// By the model as first declared, and with the effects that criticism added.
-    pub residuals: [ResidualSum; 2],
+    /// The part's radius about its axis \[m\]: what turns are counted by as positions.
+    pub radius_m: f64,
+    /// Squared forces by time \[N² s or (N·m)² s\], and the time \[s\].
+    pub force: (f64, f64),
+    /// Squared joint positions \[m² or rad²\], and how many.
+    pub position: (f64, usize),
+    /// The residual force by time, position and rate.
+    pub residuals: Vec<ResidualSample>,
+}
+
+/// A residual force at a moment.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ResidualSample {
+    /// Since time zero \[s\].
+    pub time_s: f64,
+    /// Joint position \[m or rad\].
+    pub position: f64,
+    /// Joint rate \[m/s or rad/s\].
+    pub rate: f64,
+    /// What the model lacks \[N or N·m\].
+    pub force: f64,
+}
+
+/// The scores of one model.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct StageScore {
+    /// What the model has beyond the declared physics: part (none for the sensor) and name.
+    pub effects: Vec<(Option<Label>, &'static str)>,
+    /// By part, those that moved.
+    pub parts: BTreeMap<Label, PartScore>,
 }
 
 /// The scores of a stream.
@@ -34,8 +64,8 @@ pub struct PartScore {
 pub struct Scores {
     /// Windows that closed.
     pub windows: usize,
-    /// By part, those that were scored.
-    pub parts: BTreeMap<Label, PartScore>,
+    /// The declared physics first, what was selected last.
+    pub stages: Vec<StageScore>,
 }
 
 /// Scoring under way.
@@ -43,6 +73,7 @@ pub struct Scores {
 pub(super) struct Scoring {
     horizon_s: f64,
     scores: Scores,
+    models: Option<Vec<Stage>>,
 }
 
 impl Pipeline {
@@ -52,7 +83,7 @@ impl Pipeline {
     /// If the settings contradict what was saved.
     pub fn evaluate(settings: PipelineSettings, saved: SavedObject, horizon_s: f64) -> Result<Self, ResumeError> {
         let mut pipeline = Self::resume(settings, saved)?;
-        pipeline.scoring = Some(Scoring { horizon_s, scores: Scores::default() });
+        pipeline.scoring = Some(Scoring { horizon_s, scores: Scores::default(), models: None });
         Ok(pipeline)
     }
 
@@ -66,55 +97,114 @@ impl Scoring {
     /// Scores a window; where its parts ended is all that the object takes from it.
     pub(super) fn score(&mut self, learner: &mut Learner, job: &WindowJob) {
         self.scores.windows += 1;
-        let path = learner.measured_path(job);
-        let Some(fit) = &learner.fit else { return };
-        let Some(full) = TrackedMechanism::new(fit, &learner.dynamics, 1.0) else { return };
-        let Some(declared) = full.without_effects() else { return };
-        let residuals = [&declared, &full].map(|mechanism| path.residuals(mechanism, self.horizon_s));
-        for (index, joint) in full.joints.iter().enumerate() {
-            let [Some(before), Some(after)] = [residuals[0][index], residuals[1][index]] else { continue };
-            let part = self.scores.parts.entry(joint.child).or_default();
+        let models = self.models.get_or_insert_with(|| learner.stages(job.zero));
+        if let Some(window) = learner.unlearned_window(job) {
+            self.scores.add(models, &window, learner, self.horizon_s);
+        }
+    }
+}
+
+impl Scores {
+    fn add(&mut self, models: &[Stage], window: &BatchWindow, learner: &Learner, horizon_s: f64) {
+        self.stages.resize_with(models.len(), StageScore::default);
+        for (model, stage) in models.iter().zip(&mut self.stages) {
+            stage.effects.clone_from(&model.effects);
+            let residual = model.hypothesis.window(window, model.noise_scale).residual(&model.x, horizon_s);
+            match residual {
+                Ok(residual) => stage.add(&residual, window, learner),
+                Err(failure) => tracing::warn!(%failure, effects = ?model.effects, "a window is not scored"),
+            }
+        }
+    }
+}
+
+impl StageScore {
+    fn add(&mut self, residual: &WindowResidual, window: &BatchWindow, learner: &Learner) {
+        for (column, joint) in window.moving.iter().enumerate() {
+            let Some(joint) = learner.joints().get(*joint) else { continue };
+            let part = self.parts.entry(joint.child).or_default();
             part.windows += 1;
             part.turns = joint.joint_type == JointType::Revolute;
-            part.residuals[0].add(&before);
-            part.residuals[1].add(&after);
+            part.radius_m = joint.radius;
+            for ((time_s, length_s, force), (position, rate)) in residual.forces.iter().zip(&residual.states) {
+                let force = force[column];
+                part.force.0 += length_s * force.powi(2);
+                part.force.1 += length_s;
+                let (position, rate) = (position[column], rate[column]);
+                part.residuals.push(ResidualSample { time_s: *time_s, position, rate, force });
+            }
+            part.position.0 += residual.squares[column].0;
+            part.position.1 += residual.squares[column].1;
         }
     }
 }
 
 impl Learner {
-    /// Where the known joints were in a window's frames, each part measured against its model.
-    fn measured_path(&mut self, job: &WindowJob) -> MeasuredPath {
-        let (motions, _) = explain_contacts(&self.scene(job), &self.posed_motions(job).0, false);
-        let settings = AlignmentSettings { gate: GATE, ..AlignmentSettings::default() };
+    /// Scores the models on criticism's way on the windows that they were fitted to. `zero`: what times
+    /// count from.
+    pub fn fitted_scores(&self, zero: Stamp, horizon_s: f64) -> Scores {
+        let mut scores = Scores { windows: self.windows.len(), stages: Vec::new() };
+        let Some(fit) = &self.fit else { return scores };
+        let models = self.stages(zero);
+        let windows: Vec<&WindowObservations> = self.windows.iter().collect();
+        for window in self.dynamics.batch(fit, &self.input(&windows, zero), usize::MAX) {
+            scores.add(&models, &window, self, horizon_s);
+        }
+        scores
+    }
+
+    fn input<'a>(&'a self, windows: &'a [&'a WindowObservations], zero: Stamp) -> DynamicsInput<'a> {
+        DynamicsInput { windows, contacts: &[], zero, parts: &self.hulls, use_tool: self.use_tool }
+    }
+
+    /// The models on criticism's way; none where nothing could be fitted. `zero`: what times count from.
+    fn stages(&self, zero: Stamp) -> Vec<Stage> {
+        let Some(fit) = &self.fit else { return Vec::new() };
+        let windows: Vec<&WindowObservations> = self.windows.iter().collect();
+        let input = self.input(&windows, zero);
+        self.critic.stages(&self.dynamics, fit, &input).unwrap_or_else(|failure| {
+            tracing::warn!(%failure, "the saved model cannot be fitted to its windows");
+            Vec::new()
+        })
+    }
+
+    /// A window in joint space, measured with the joints as they are known; `None` where none moves.
+    fn unlearned_window(&mut self, job: &WindowJob) -> Option<BatchWindow> {
+        let (posed, mut poses) = self.posed_motions(job);
+        let bound = job.wrenches.iter().any(|wrench| wrench.part.is_some());
+        let (motions, contacts) = explain_contacts(&self.scene(job), &posed, !bound);
+        let direct = poses.keys().filter_map(|label| Some((*label, self.posed.get(label)?.information))).collect();
         for (label, motion) in &motions {
             if let Some(end) = motion.displacements.last() {
                 self.displacements.insert(*label, *end);
             }
         }
+        let settings = AlignmentSettings { gate: GATE, ..AlignmentSettings::default() };
         let joints = self.joints().to_vec();
         let mut tracks: Vec<Vec<Pose>> = Vec::new();
         let mut positions: Vec<Vec<f64>> = Vec::new();
         for joint in &joints {
             let start = self.displacements.get(&joint.child).copied().unwrap_or_else(Pose::identity);
+            let seen = poses.entry(joint.child).or_insert_with(|| {
+                let measured = |(k, frame): (usize, &super::explain::Frame)| {
+                    let expected = motions.get(&joint.child).map_or(start, |motion| motion.displacements[k]);
+                    measure(self.models.get(&joint.child)?, frame.scans.get(&joint.child)?, &expected, &settings)
+                };
+                job.frames.iter().enumerate().map(measured).collect()
+            });
             let parent = |k: usize| joint.parent.map_or_else(Pose::identity, |p| tracks[p][k]);
             let screw = joint.screw();
-            let mut last = 0.0;
-            let path: Vec<f64> = (0..job.frames.len())
-                .map(|k| {
-                    let expected = motions.get(&joint.child).map_or(start, |motion| motion.displacements[k]);
-                    let scan = job.frames[k].scans.get(&joint.child);
-                    let seen = self.models.get(&joint.child).zip(scan);
-                    let seen = seen.and_then(|(model, scan)| measure(model, scan, &expected, &settings));
-                    let posed = job.frames[k].poses.get(&joint.child).zip(self.posed.get(&joint.child));
-                    let seen = posed.map(|(pose, part)| part.measurement(pose)).or(seen);
-                    if let Some(measured) = seen {
-                        let displacement = parent(k).inverse() * measured.displacement;
-                        last = nearest_position(joint, &screw, &PoseMeasurement { displacement, ..measured }, last);
-                    }
-                    last
-                })
-                .collect();
+            let mut last = None;
+            let mut path: Vec<f64> = Vec::with_capacity(job.frames.len());
+            for (k, measured) in seen.iter().enumerate() {
+                if let Some(measured) = measured {
+                    let displacement = parent(k).inverse() * measured.displacement;
+                    let measured = PoseMeasurement { displacement, ..*measured };
+                    let near = last.unwrap_or_else(|| nearest_position(joint, &screw, &measured, 0.0));
+                    last = Some(nearest_position(joint, &screw, &measured, near));
+                }
+                path.push(last.unwrap_or(0.0));
+            }
             let track: Vec<Pose> = path.iter().enumerate().map(|(k, q)| parent(k) * screw.displacement(*q)).collect();
             if let Some(end) = track.last() {
                 self.displacements.insert(joint.child, *end);
@@ -122,42 +212,34 @@ impl Learner {
             tracks.push(track);
             positions.push(path);
         }
-        let touched = job.contacts.iter().find(|contact| !contact.track.is_empty());
-        let touched = touched.and_then(|contact| joints.iter().position(|joint| joint.child == contact.label));
-        MeasuredPath {
+        let mut fit = self.fit.clone()?;
+        let point_of = |contact: &crate::model::Contact| {
+            let joint = joints.iter().position(|joint| joint.child == contact.label);
+            let at = |(frame, x, _): &(usize, Vector3<f64>, f64)| {
+                let displacement = joint.map_or_else(Pose::identity, |joint| tracks[joint][*frame]);
+                displacement.inverse().transform_point(&(x - fit.tool_offset))
+            };
+            contact.track.iter().map(at).sum::<Vector3<f64>>() / contact.track.len().max(1) as f64
+        };
+        let points: Vec<Vector3<f64>> = contacts.iter().map(point_of).collect();
+        fit.contact_points.push(points);
+        fit.positions.push(positions);
+        let observations = WindowObservations {
             times_s: job.frames.iter().map(|frame| frame.time_s).collect(),
-            positions,
-            samples: self.contact_wrench(job),
-            touched,
-        }
-    }
-
-    /// The readings while the tool holds a part, zero before and after.
-    fn contact_wrench(&self, job: &WindowJob) -> Vec<WrenchSample> {
-        let Some(contact) = job.contacts.iter().find(|contact| !contact.track.is_empty()) else { return Vec::new() };
-        let time = |entry: Option<&(usize, nalgebra::Vector3<f64>, f64)>| {
-            entry.and_then(|(k, _, _)| job.frames.get(*k)).map_or(0.0, |frame| frame.time_s)
+            contacts: if self.use_tool { contacts.clone() } else { Vec::new() },
+            wrenches: job.wrenches.clone(),
+            direct,
+            poses,
+            ..WindowObservations::default()
         };
-        let span = time(contact.track.first()) - CONTACT_MARGIN_S..=time(contact.track.last()) + CONTACT_MARGIN_S;
-        let offset = self.fit.as_ref().map_or_else(nalgebra::Vector3::zeros, |fit| fit.tool_offset);
-        let reading = |wrench: &crate::types::AppliedWrench| WrenchSample {
-            stamp_s: wrench.stamp.seconds_since(job.zero),
-            point_in_world: wrench.point_in_world - offset,
-            force_in_world: wrench.force_in_world,
-            torque_in_world: wrench.torque_in_world,
+        let windows: Vec<&WindowObservations> = self.windows.iter().chain([&observations]).collect();
+        let input = DynamicsInput {
+            windows: &windows,
+            contacts: &contacts,
+            zero: job.zero,
+            parts: &self.hulls,
+            use_tool: self.use_tool,
         };
-        let mut samples: Vec<WrenchSample> =
-            job.wrenches.iter().map(reading).filter(|sample| span.contains(&sample.stamp_s)).collect();
-        let none = |sample: &WrenchSample, shift_s: f64| WrenchSample {
-            stamp_s: sample.stamp_s + shift_s,
-            force_in_world: nalgebra::Vector3::zeros(),
-            torque_in_world: nalgebra::Vector3::zeros(),
-            ..*sample
-        };
-        if let (Some(first), Some(last)) = (samples.first().copied(), samples.last().copied()) {
-            samples.insert(0, none(&first, -CONTACT_EDGE_S));
-            samples.push(none(&last, CONTACT_EDGE_S));
-        }
-        samples
+        self.dynamics.unlearned_window(&fit, &input)
     }
 }

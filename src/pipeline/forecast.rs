@@ -6,7 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix3, Vector3, Vector6};
 
 use super::explain::{measure, travel};
 use super::touch::{Touch, Toucher, first_push};
@@ -15,7 +15,9 @@ use super::{Frame, Learner, Output, PipelineSettings};
 use crate::math::Pose;
 use crate::mechanism::WrenchSample;
 use crate::registration::AlignmentSettings;
-use crate::tracking::{Calibration, Filter, FreePart, Kind, Skill, TrackedMechanism, mix};
+use crate::tracking::{
+    Calibration, Filter, Forecast, FreeAccount, FreePart, JointAccount, Kind, Skill, TrackedMechanism, mixture,
+};
 use crate::types::{AppliedWrench, Label, Stamp};
 
 /// How far ahead \[s\].
@@ -191,16 +193,19 @@ impl Forecaster {
         self.ready(|pending| sample.stamp_s >= pending.time_s + HORIZONS[2])
     }
 
-    /// What a window taught, to count from its close \[s\] plus the latency. Where the stream went
-    /// on meanwhile, `current` is where the parts are by now: the filter starts from there.
-    pub fn learned(&mut self, learner: &Learner, current: Option<&BTreeMap<Label, Pose>>) {
+    /// What a window taught, to count from its close \[s\] plus the latency, with its mechanism. Where the
+    /// stream went on meanwhile, `current` is where the parts are by now: the filter starts from there.
+    pub fn learned(
+        &mut self,
+        learner: &Learner,
+        mechanism: Option<Arc<TrackedMechanism>>,
+        current: Option<&BTreeMap<Label, Pose>>,
+    ) {
         let (Some(close_s), Some(window)) =
             (learner.windows.last().and_then(|w| w.times_s.last()).copied(), learner.windows.last())
         else {
             return;
         };
-        let noise_scale = learner.inferences.last().map_or(1.0, |inference| inference.noise_scale);
-        let mechanism = learner.fit.as_ref().and_then(|fit| TrackedMechanism::new(fit, &learner.dynamics, noise_scale));
         let start = window.times_s.partition_point(|t| *t < close_s - RUN_UP).min(window.times_s.len() - 1);
         let (before, after) = (start.saturating_sub(1), (start + 1).min(window.times_s.len() - 1));
         let span = window.times_s[after] - window.times_s[before];
@@ -217,7 +222,7 @@ impl Forecaster {
         self.root = Some(learner.root);
         let mut new = Waiting {
             from_s: close_s + self.latency_s,
-            mechanism: mechanism.map(Arc::new),
+            mechanism,
             start_s: window.times_s[start],
             close_s,
             positions,
@@ -232,12 +237,10 @@ impl Forecaster {
 
     /// Starts from a saved object whose joints are at `positions` now.
     pub fn resumed(&mut self, learner: &Learner, now_s: f64, positions: Vec<f64>) {
-        let noise_scale = learner.inferences.last().map_or(1.0, |inference| inference.noise_scale);
-        let mechanism = learner.fit.as_ref().and_then(|fit| TrackedMechanism::new(fit, &learner.dynamics, noise_scale));
         self.root = Some(learner.root);
         self.waiting.push(Waiting {
             from_s: now_s,
-            mechanism: mechanism.map(Arc::new),
+            mechanism: mechanism_of(learner),
             start_s: now_s,
             close_s: now_s,
             rates: vec![0.0; positions.len()],
@@ -291,6 +294,13 @@ impl Forecaster {
             skills: self.skills.clone(),
             rest_force,
         });
+        let state = self.state(&self.told).into_iter();
+        outputs.extend(state.map(|(label, (displacement, twist))| Output::Tracked {
+            time_s: now_s,
+            label,
+            displacement,
+            twist,
+        }));
         if self.live {
             // The last reading stands for those to come.
             outputs.extend(self.ready(|_| true));
@@ -375,7 +385,7 @@ impl Forecaster {
                 let joint = jointed.get(label);
                 let (displacement, covariance) = match joint {
                     _ if root => (Pose::identity(), Matrix3::from_diagonal_element(ROOT_DEVIATION.powi(2))),
-                    Some(ways) => mix(ways.expected[horizon], free, told.by_joint, &center),
+                    Some(ways) => ways.expected[horizon],
                     None => free,
                 };
                 let expected = displacement.transform_point(&center);
@@ -399,43 +409,85 @@ impl Forecaster {
         }
     }
 
-    /// Predictions by joints: the mechanism's, its rates' and rest's, as they did of late.
+    /// Predictions of the parts with joints, as the tree can go: the mechanism's, its rates' and rest's, as
+    /// they did of late, with what is said of the parts without their joints.
     fn by_joints(&self, pending: &Pending) -> BTreeMap<Label, Jointed> {
         let Some(filter) = &pending.filter else { return BTreeMap::new() };
+        let mechanism = filter.mechanism();
         let plain = filter.forecast(&HORIZONS, &self.samples);
         let touched = pending.near.filter(|_| self.next_push(pending).is_some()).and_then(|(label, point)| {
-            let body = filter.mechanism().body(label)?;
+            let body = mechanism.body(label)?;
             let mut filter = filter.clone();
-            filter.hold(body, &(point + filter.mechanism().tool_offset), TOUCH_DEVIATION);
+            filter.hold(body, &(point + mechanism.tool_offset), TOUCH_DEVIATION);
             Some(filter.forecast(&HORIZONS, &self.samples))
         });
+        let skills: Vec<_> =
+            mechanism.joints.iter().map(|j| pending.skills.get(&j.child).copied().unwrap_or_default()).collect();
         let mut jointed: BTreeMap<Label, Jointed> = BTreeMap::new();
-        let steady = filter.steady(&HORIZONS);
-        for (index, forecast) in plain.iter().enumerate() {
-            let mut simulated = (forecast.displacement, forecast.covariance_m2);
-            if let Some(touched) = touched.as_ref().and_then(|touched| touched.get(index)) {
-                let other = (touched.displacement, touched.covariance_m2);
-                simulated = mix(other, simulated, TOUCHES, &forecast.center);
+        for (horizon, horizon_s) in HORIZONS.into_iter().enumerate() {
+            let Some(simulated) = plain.get(horizon) else { continue };
+            let account = |forecast: &Forecast, weights: Vec<f64>| JointAccount {
+                weights,
+                positions: forecast.positions.clone(),
+                covariances_m2: forecast.covariances_m2.clone(),
+            };
+            let all = |weight: f64| vec![weight; skills.len()];
+            let accounts = if let Some(touched) = touched.as_ref().and_then(|touched| touched.get(horizon)) {
+                vec![account(touched, all(TOUCHES)), account(simulated, all(1.0 - TOUCHES))]
+            } else if pending.near.is_some() {
+                vec![account(simulated, all(1.0))]
+            } else {
+                let judged = horizon.min(JUDGED.len() - 1);
+                let shown: Vec<_> = skills.iter().map(|skill| skill[judged].weights(JUDGED[judged].1)).collect();
+                let weights = |way: usize| shown.iter().map(|shares| shares[way].0).collect();
+                let mut accounts = vec![account(simulated, weights(0))];
+                for (way, positions) in (1..).zip(filter.steady(horizon_s)) {
+                    let spreads = simulated.covariances_m2.iter().zip(&shown);
+                    let spread = spreads.map(|(own, shares)| own + Matrix3::identity() * shares[way].1).collect();
+                    accounts.push(JointAccount { weights: weights(way), positions, covariances_m2: spread });
+                }
+                accounts
+            };
+            let alone = |label: Label| {
+                let told = pending.told.get(&label)?;
+                let (displacement, covariance_m2) = told.free.after(horizon_s);
+                Some(FreeAccount { weight: 1.0 - told.by_joint, displacement, covariance_m2 })
+            };
+            let free: Vec<_> = mechanism.joints.iter().map(|joint| alone(joint.child)).collect();
+            for (body, mixed) in mixture(mechanism, &accounts, &free).into_iter().enumerate() {
+                let center = mechanism.centers[body];
+                let nowhere = [(Pose::identity(), Matrix3::zeros()); HORIZONS.len()];
+                let entry = jointed.entry(mechanism.joints[body].child);
+                let entry = entry.or_insert(Jointed { center, expected: nowhere });
+                entry.expected[horizon] = (mixed.displacement, mixed.covariance_m2);
             }
-            let skill = pending.skills.get(&forecast.label).copied().unwrap_or_default();
-            let judged = forecast.horizon.min(JUDGED.len() - 1);
-            let weights = skill[judged].weights(JUDGED[judged].1);
-            let mut mixed = simulated;
-            if let Some([by_rate, at_rest]) = steady.get(&forecast.label).map(|ways| ways[forecast.horizon])
-                && pending.near.is_none()
-            {
-                let spread = |way: usize| forecast.covariance_m2 + Matrix3::identity() * weights[way].1;
-                let others = weights[1].0 + weights[2].0;
-                let share = weights[1].0 / others.max(1e-12);
-                let other = mix((by_rate, spread(1)), (at_rest, spread(2)), share, &forecast.center);
-                mixed = mix(simulated, other, weights[0].0, &forecast.center);
-            }
-            let entry = jointed
-                .entry(forecast.label)
-                .or_insert_with(|| Jointed { center: forecast.center, expected: [simulated; HORIZONS.len()] });
-            entry.expected[forecast.horizon] = mixed;
         }
         jointed
+    }
+
+    /// Where every part is now, as the tree has it, with its joint's twist against its parent.
+    fn state(&self, told: &BTreeMap<Label, Told>) -> BTreeMap<Label, (Pose, Vector6<f64>)> {
+        let mut state: BTreeMap<Label, (Pose, Vector6<f64>)> =
+            told.iter().map(|(label, told)| (*label, (told.now, Vector6::zeros()))).collect();
+        let Some(filter) = &self.filter else { return state };
+        let mechanism = filter.mechanism();
+        let count = mechanism.joints.len();
+        let account = JointAccount {
+            weights: vec![1.0; count],
+            positions: filter.positions().to_vec(),
+            covariances_m2: vec![Matrix3::zeros(); count],
+        };
+        let by_joint = |label: Label| told.get(&label).map_or(1.0, |told| told.by_joint);
+        let alone = |label: Label| {
+            let FreePart { displacement, .. } = told.get(&label)?.free;
+            Some(FreeAccount { weight: 1.0 - by_joint(label), displacement, covariance_m2: Matrix3::zeros() })
+        };
+        let free: Vec<_> = mechanism.joints.iter().map(|joint| alone(joint.child)).collect();
+        let bodies = mixture(mechanism, &[account], &free);
+        for ((joint, mixed), rate) in mechanism.joints.iter().zip(bodies).zip(filter.rates()) {
+            state.insert(joint.child, (mixed.displacement, joint.screw().0 * (rate * by_joint(joint.child))));
+        }
+        state
     }
 
     /// When the tool first pushes within the horizons after a stamp \[s\].
@@ -468,10 +520,10 @@ impl Forecaster {
             let Some(pending) = made.find(|p| (p.time_s - then_s).abs() < SAME_STAMP) else { continue };
             let Some(filter) = &pending.filter else { continue };
             let simulated = filter.expect(now_s, &self.samples);
-            let steady = filter.steady(&[now_s - pending.time_s]);
+            let [moved, stopped] = filter.steady(now_s - pending.time_s).map(|positions| filter.placed(&positions));
             for (label, told) in told {
-                let (Some(simulated), Some([[by_rate, at_rest]]), Some(model)) =
-                    (simulated.get(label), steady.get(label).map(Vec::as_slice), learner.models.get(label))
+                let (Some(simulated), Some(by_rate), Some(at_rest), Some(model)) =
+                    (simulated.get(label), moved.get(label), stopped.get(label), learner.models.get(label))
                 else {
                     continue;
                 };
@@ -486,6 +538,13 @@ impl Forecaster {
             }
         }
     }
+}
+
+/// The joints that a learner knows, as tracking needs them; `None` without any.
+pub(super) fn mechanism_of(learner: &Learner) -> Option<Arc<TrackedMechanism>> {
+    let noise_scale = learner.inferences.last().map_or(1.0, |inference| inference.noise_scale);
+    let fit = learner.fit.as_ref()?;
+    TrackedMechanism::new(fit, &learner.dynamics, noise_scale).map(Arc::new)
 }
 
 /// A part's predictions by joints.

@@ -71,16 +71,21 @@ impl Keyframes {
         }
     }
 
-    /// All scans at their places; `tracks` by window and frame.
-    pub fn accumulated(&self, tracks: &[Vec<Pose>]) -> SurfelAccumulator {
+    /// Where each scan belongs, `None` where that is not known; `tracks` by window and frame.
+    pub fn places(&self, tracks: &[Vec<Pose>]) -> Vec<Option<Pose>> {
+        let place = |keyframe: &Keyframe| match keyframe.place {
+            Place::Frame { window, frame } => tracks.get(window).and_then(|track| track.get(frame)).copied(),
+            Place::Fixed(displacement) => Some(displacement),
+        };
+        self.0.iter().map(place).collect()
+    }
+
+    /// All scans, each at its place.
+    pub fn accumulated(&self, places: &[Option<Pose>]) -> SurfelAccumulator {
         let mut accumulator = SurfelAccumulator::default();
-        for Keyframe { place, scan } in &self.0 {
-            let displacement = match place {
-                Place::Frame { window, frame } => tracks.get(*window).and_then(|track| track.get(*frame)).copied(),
-                Place::Fixed(displacement) => Some(*displacement),
-            };
-            if let Some(displacement) = displacement {
-                accumulator.add(scan, &displacement);
+        for (keyframe, place) in self.0.iter().zip(places) {
+            if let Some(displacement) = place {
+                accumulator.add(&keyframe.scan, displacement);
             }
         }
         accumulator
@@ -158,12 +163,12 @@ mod tests {
         }
         let place = |x: f64| Pose::from_translation(Vector3::x() * x);
         let mut tracks = vec![vec![place(0.0); 2], vec![place(1.0); 2], vec![place(2.0); 2]];
-        let before = keyframes.accumulated(&tracks).surfels();
+        let before = keyframes.accumulated(&keyframes.places(&tracks)).surfels();
         keyframes.retire(1, &tracks.remove(1));
         let places: Vec<Place> = keyframes.0.iter().map(|keyframe| keyframe.place).collect();
         let frame = |window| Place::Frame { window, frame: 0 };
         assert_eq!(places, [frame(0), Place::Fixed(place(1.0)), frame(1)]);
-        assert_eq!(keyframes.accumulated(&tracks).surfels(), before);
+        assert_eq!(keyframes.accumulated(&keyframes.places(&tracks)).surfels(), before);
     }
 
     #[test]

@@ -44,8 +44,15 @@ const FARTHEST_PENALTY: f64 = 40.0;
 const WELL_AGAINST_BADLY: f64 = 20.0;
 /// The least probability that a part's evidence stands on a wrong explanation.
 const LEAST_DOUBT: f64 = 1e-3;
-/// Windows whose frames are kept for measuring again: about 7 MB each.
+/// A part's model stands while its keyframes stay within this of where it has them \[m\].
+const REBUILT: f64 = 0.0003;
+/// Hypotheses this far behind are not sought from new starts \[nats\].
+const HOPELESS: f64 = 100.0;
+/// Windows whose frames are kept for measuring again, of at most so many points in all: 84 MB.
 const KEPT_FRAMES: usize = 8;
+const KEPT_POINTS: usize = 1_500_000;
+/// Frames in which a part is measured in a window that it rests through: they share their error.
+const RESTING_FRAMES: usize = 20;
 /// A part is measured again where a later fit has moved it by more than this \[m\].
 const MEASURED_AGAIN: f64 = 0.002;
 
@@ -151,6 +158,9 @@ pub struct Learner {
     /// Where each part was when each window's scans were measured last.
     #[serde(skip)]
     pub(super) measured_at: BTreeMap<Label, Vec<Vec<Pose>>>,
+    /// Where each model has its keyframes.
+    #[serde(skip)]
+    built_at: BTreeMap<Label, Vec<Option<Pose>>>,
     /// What scans cost at known poses.
     pub baselines: BTreeMap<Label, Baseline>,
     /// Parts that the tool has moved.
@@ -210,6 +220,7 @@ impl Learner {
             kept_windows: usize::MAX,
             kept: Vec::new(),
             measured_at: BTreeMap::new(),
+            built_at: BTreeMap::new(),
             gaps,
             baselines: BTreeMap::new(),
             displacements: BTreeMap::new(),
@@ -477,11 +488,14 @@ impl Learner {
         }
         let settings = AlignmentSettings { gate: 0.02, ..AlignmentSettings::default() };
         let Some(track) = self.tracks.get(&label).and_then(|t| t.get(window)) else { return };
+        let rests = track.windows(2).all(|pair| pair[0] == pair[1]);
+        let every = if rests { frames.len().div_ceil(RESTING_FRAMES).max(1) } else { 1 };
         let faces: Vec<_> = frames
             .iter()
             .zip(track)
-            .map(|(frame, displacement)| match (self.models.get(&label), frame.scans.get(&label)) {
-                (Some(model), Some(scan)) => {
+            .enumerate()
+            .map(|(k, (frame, displacement))| match (self.models.get(&label), frame.scans.get(&label)) {
+                (Some(model), Some(scan)) if k % every == 0 => {
                     let past = rays_past(frame, label, model, displacement);
                     measure_faces(model, scan, &past, displacement, &settings)
                 }
@@ -502,8 +516,12 @@ impl Learner {
         // Frames of windows that were saved and loaded are gone.
         self.kept.resize(self.windows.len().saturating_sub(1), Arc::default());
         self.kept.push(Arc::new(job.frames.clone()));
-        if let Some(forgotten) = self.kept.len().checked_sub(KEPT_FRAMES + 1) {
-            self.kept[forgotten] = Arc::default();
+        let mut points = 0;
+        for (age, window) in self.kept.iter_mut().rev().enumerate() {
+            points += window.iter().flat_map(|frame| frame.scans.values()).map(Vec::len).sum::<usize>();
+            if age >= KEPT_FRAMES || (age > 0 && points > KEPT_POINTS) {
+                *window = Arc::default();
+            }
         }
     }
 
@@ -602,7 +620,10 @@ impl Learner {
         let log_evidence = past.map(|past| past + rigid);
         let mut option = ParentEvidence { parent, log_evidence, fits: [None, None, None], rigid_by_window, past };
         for joint_type in [JointType::Prismatic, JointType::Revolute] {
-            let starts = self.start_axes(&part, parent, joint_type, &relative, motions);
+            let mut starts = self.start_axes(&part, parent, joint_type, &relative, motions);
+            if self.is_hopeless(child, parent, joint_type) {
+                starts.truncate(1);
+            }
             let fit = moving_evidence(&part, joint_type, &starts, &relative, &resting, &self.settings);
             let slot = joint_type as usize;
             if let Some(mut fit) = fit {
@@ -612,6 +633,17 @@ impl Learner {
             }
         }
         option
+    }
+
+    /// Whether a hypothesis trails the child's best so far by more than another start would find: it is
+    /// refitted from where it was.
+    fn is_hopeless(&self, child: Label, parent: Option<Label>, joint_type: JointType) -> bool {
+        let options = self.evidence.get(&child).map_or(&[][..], Vec::as_slice);
+        let best = options.iter().flat_map(|option| option.log_evidence).fold(f64::NEG_INFINITY, f64::max);
+        options.iter().find(|option| option.parent == parent).is_some_and(|option| {
+            let slot = joint_type as usize;
+            option.fits[slot].is_some() && option.log_evidence[slot] < best - HOPELESS
+        })
     }
 
     /// Turns a fit the way the one before counted: an axis's sign is free, but what was learned goes by it.
@@ -862,16 +894,30 @@ impl Learner {
 
     /// Models of the moving parts, from the first look and the keyframes where the fit has them now.
     fn rebuild_models(&mut self) {
-        let rebuilt: Vec<(Label, Option<PartModel>)> = self
+        let rebuilt: Vec<(Label, PartModel, Vec<Option<Pose>>)> = self
             .keyframes
             .par_iter()
-            .map(|(label, keyframes)| {
-                let tracks = self.tracks.get(label).map_or(&[][..], Vec::as_slice);
-                let later = keyframes.accumulated(tracks);
-                (*label, self.reference.get(label).map(|first| first.grown(&later.surfels())))
+            .filter_map(|(label, keyframes)| {
+                let first = self.reference.get(label)?;
+                let places = keyframes.places(self.tracks.get(label).map_or(&[][..], Vec::as_slice));
+                let stands = |built: &Vec<Option<Pose>>| {
+                    built.len() == places.len()
+                        && built.iter().zip(&places).all(|pair| match pair {
+                            (Some(old), Some(new)) => travel(first, old, new) < REBUILT,
+                            (old, new) => old.is_some() == new.is_some(),
+                        })
+                };
+                if self.built_at.get(label).is_some_and(stands) {
+                    return None;
+                }
+                let later = keyframes.accumulated(&places);
+                Some((*label, first.grown(&later.surfels()), places))
             })
             .collect();
-        self.models.extend(rebuilt.into_iter().filter_map(|(label, model)| Some((label, model?))));
+        for (label, model, places) in rebuilt {
+            self.models.insert(label, model);
+            self.built_at.insert(label, places);
+        }
     }
 }
 

@@ -2,6 +2,7 @@
 
 mod evaluate;
 mod explain;
+mod first_look;
 mod forecast;
 mod keyframes;
 mod learner;
@@ -21,30 +22,34 @@ use std::sync::Arc;
 
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
-pub use evaluate::{PartScore, Scores};
+pub use evaluate::{PartScore, ResidualSample, Scores, StageScore};
 pub use explain::Frame;
+pub use first_look::FirstLook;
 pub use learner::{Learner, ParentEvidence, WindowJob};
 pub use planning::Planner;
 pub use poses::PoseSettings;
 pub use saved::{ResumeError, SavedObject, SavedObjectRef, Snapshot};
 pub use windows::{FrameAssembler, WindowCutter, WindowSettings};
-pub use worker::{ClosedWindow, Learned, Worker};
+pub use worker::{ClosedWindow, Learned, Looked, Worker};
 
 use crate::inference::SamplingSettings;
 use crate::math::Pose;
-use crate::model::{DeclaredPhysics, DynamicsLearner, KinematicSettings, PoseMeasurement};
-use crate::registration::{AlignmentSettings, Quadratic, SurfelAccumulator, align, truncated_cost};
+use crate::model::{DeclaredPhysics, KinematicSettings, PoseMeasurement};
+use crate::registration::{AlignmentSettings, Quadratic, align, truncated_cost};
 use crate::types::{Input, Label, Stamp};
 use evaluate::Scoring;
 use explain::{FEWEST_POINTS, measurement_of, travel};
-use forecast::Forecaster;
-use poses::{POSED_RADIUS, PoseBuffer, PosedPart, RECORD_GAP, references};
+use first_look::REFERENCE_FRAMES;
+use forecast::{Forecaster, mechanism_of};
+use poses::{POSED_RADIUS, PoseBuffer, PosedPart, RECORD_GAP};
 use saved::Resumed;
-use windows::frame_of;
+use windows::{CutWindow, frame_of};
+use worker::Begin;
 use working_frame::WorkingFrame;
 
-/// Frames of the first look that the reference models are made of.
-const REFERENCE_FRAMES: usize = 20;
+/// Frames at rest after which a live stream has models made, to track with until the first contact's are
+/// there.
+const PREVIEW_FRAMES: usize = 10;
 /// Rise of the mean truncated cost at an older pose that shows motion.
 const MOVING_COST: f64 = 0.15;
 
@@ -104,6 +109,17 @@ pub enum Output {
         /// Covariance of its centre of mass, held fixed in the part \[m²\].
         covariance_m2: Matrix3<f64>,
     },
+    /// Where tracking has a part, by its joint if it has one; with predictions.
+    Tracked {
+        /// Seconds since time zero.
+        time_s: f64,
+        /// The part.
+        label: Label,
+        /// Its displacement since the first frame.
+        displacement: Pose,
+        /// Its joint's screw at the reference configuration times its rate, (angular \[rad/s\], linear \[m/s\]).
+        twist: Vector6<f64>,
+    },
     /// A saved object was taken up at the stream's first frame.
     Resumed {
         /// Its root.
@@ -113,6 +129,8 @@ pub enum Output {
         /// Parts that the object did not have; they are added.
         unknown: Vec<Label>,
     },
+    /// The object at rest has been seen, for a [`Worker`] to make its models; only if live.
+    FirstLook(Arc<FirstLook>),
     /// A window closed, for a [`Worker`] to learn; only if live.
     WindowClosed(Box<ClosedWindow>),
     /// A window was learned.
@@ -132,8 +150,11 @@ pub struct Pipeline {
     last_frame_s: Option<f64>,
     early: Vec<Input>,
     cutter: Option<WindowCutter>,
-    accumulators: BTreeMap<Label, SurfelAccumulator>,
     reference: Vec<Frame>,
+    /// The first look, from the first contact until its models are there.
+    first_look: Option<Arc<FirstLook>>,
+    /// Models of less than the first look, to track with until its own are there.
+    preview: Option<Arc<Learner>>,
     learner: Option<Arc<Learner>>,
     current: BTreeMap<Label, Pose>,
     recent: Vec<BTreeMap<Label, Pose>>,
@@ -169,8 +190,9 @@ impl Pipeline {
             assembler: FrameAssembler::default(),
             early: Vec::new(),
             cutter: None,
-            accumulators: BTreeMap::new(),
             reference: Vec::new(),
+            first_look: None,
+            preview: None,
             learner: None,
             current: BTreeMap::new(),
             recent: Vec::new(),
@@ -235,8 +257,8 @@ impl Pipeline {
         for stamp in self.poses.flush() {
             outputs.extend(self.push_frame(stamp, &[]));
         }
-        let job = self.cutter.as_mut().and_then(|c| c.flush(nearest_label));
-        outputs.extend(job.and_then(|job| self.close(job)));
+        let window = self.cutter.as_mut().and_then(WindowCutter::flush);
+        outputs.extend(window.and_then(|window| self.close(window)));
         outputs.extend(self.forecaster.iter_mut().flat_map(Forecaster::finish));
         outputs
     }
@@ -270,8 +292,11 @@ impl Pipeline {
         outputs.extend(self.observe(&frame));
         let moving = self.moving;
         let seen = self.forecaster.is_some().then(|| frame.clone());
-        if !self.cutter.as_ref().is_some_and(WindowCutter::is_open) && self.learner.is_none() {
+        if !self.is_open() && self.learner.is_none() && self.first_look.is_none() {
             self.reference.push(frame.clone());
+            if self.settings.live && self.reference.len() == PREVIEW_FRAMES && self.preview.is_none() {
+                outputs.push(Output::FirstLook(Arc::new(self.look(self.reference.clone(), false))));
+            }
             // A long look at an object at rest is thinned out, not kept.
             if self.reference.len() > 4 * REFERENCE_FRAMES {
                 let mut index = 0;
@@ -284,24 +309,26 @@ impl Pipeline {
         if let Some(frames) = self.newcomers.as_mut().filter(|frames| frames.len() < REFERENCE_FRAMES) {
             frames.push(frame.clone());
         }
-        let job = self.cutter.as_mut().and_then(|c| c.push_frame(frame, moving, nearest_label));
-        if self.cutter.as_ref().is_some_and(WindowCutter::is_open)
+        let window = self.cutter.as_mut().and_then(|c| c.push_frame(frame, moving));
+        if self.is_open()
             && let Some(frames) = self.newcomers.take()
             && let Some(learner) = &mut self.learner
         {
             Arc::make_mut(learner).add_parts(&frames);
         }
-        if self.learner.is_none() && self.cutter.as_ref().is_some_and(WindowCutter::is_open) {
-            self.open_reference();
+        if self.learner.is_none() && self.first_look.is_none() && (self.is_open() || window.is_some()) {
+            outputs.extend(self.open_reference());
         }
-        let closed = job.is_some() && !self.settings.live;
-        outputs.extend(job.and_then(|job| self.close(job)));
+        let closed = window.is_some() && !self.settings.live;
+        outputs.extend(window.and_then(|window| self.close(window)));
         if let (Some(forecaster), Some(frame)) = (&mut self.forecaster, seen) {
             if let Some(learner) = self.learner.as_deref().filter(|_| closed) {
-                forecaster.learned(learner, None);
+                forecaster.learned(learner, mechanism_of(learner), None);
             }
             let rest_force = self.cutter.as_ref().and_then(WindowCutter::rest_force).unwrap_or_default();
-            outputs.extend(forecaster.push_frame(frame, self.learner.as_deref(), zero, rest_force));
+            let preview = self.preview.as_ref().filter(|_| self.first_look.is_some());
+            let learner = self.learner.as_ref().or(preview);
+            outputs.extend(forecaster.push_frame(frame, learner.map(AsRef::as_ref), zero, rest_force));
         }
         outputs
     }
@@ -309,58 +336,79 @@ impl Pipeline {
     /// Poses stayed away: the window that is open ends with the last of them.
     fn end_record(&mut self) -> Option<Output> {
         self.poses.end_record();
-        let job = self.cutter.as_mut().and_then(|cutter| cutter.end_record(nearest_label))?;
-        let output = self.close(job);
+        let window = self.cutter.as_mut().and_then(WindowCutter::end_record)?;
+        let output = self.close(window);
         if let (Some(forecaster), Some(learner), false) = (&mut self.forecaster, &self.learner, self.settings.live) {
-            forecaster.learned(learner, None);
+            forecaster.learned(learner, mechanism_of(learner), None);
         }
         output
     }
 
-    /// The object at rest has been seen: its models are made, just before the first window.
-    fn open_reference(&mut self) {
+    /// The frames of the first look, until something was learned of them.
+    fn frames_at_rest(&self) -> &[Frame] {
+        self.first_look.as_ref().map_or(&self.reference, |look| &look.frames)
+    }
+
+    fn is_open(&self) -> bool {
+        self.cutter.as_ref().is_some_and(WindowCutter::is_open)
+    }
+
+    /// What a frame is tracked with.
+    fn tracked_with(&self) -> Option<&Arc<Learner>> {
+        self.learner.as_ref().or(self.preview.as_ref().filter(|_| self.first_look.is_some()))
+    }
+
+    fn look(&self, frames: Vec<Frame>, whole: bool) -> FirstLook {
+        FirstLook { frames, settings: self.settings.clone(), gravity: self.gravity_in_work(), whole }
+    }
+
+    /// The object at rest has been seen: its models are made, just before the first window; beside the
+    /// stream if live.
+    fn open_reference(&mut self) -> Option<Output> {
         if self.reference.len() > 1 {
             self.reference.pop();
         }
-        let every = self.reference.len().div_ceil(REFERENCE_FRAMES).max(1);
-        for frame in self.reference.iter().step_by(every) {
-            for (label, scan) in &frame.scans {
-                self.accumulators.entry(*label).or_default().add(scan, &Pose::identity());
+        let frames = std::mem::take(&mut self.reference);
+        let look = self.look(frames, true);
+        if self.settings.live {
+            let look = Arc::new(look);
+            self.first_look = Some(Arc::clone(&look));
+            return Some(Output::FirstLook(look));
+        }
+        self.learner = Some(Arc::new(look.learner()));
+        None
+    }
+
+    /// Takes over the models that a worker made of a first look.
+    pub fn adopt_models(&mut self, looked: &Looked) {
+        if self.learner.is_none() {
+            if looked.whole {
+                (self.learner, self.preview) = (Some(Arc::clone(&looked.learner)), None);
+            } else {
+                self.preview = Some(Arc::clone(&looked.learner));
             }
         }
-        let accumulators = std::mem::take(&mut self.accumulators);
-        let posed = references(&self.reference);
-        let largest = accumulators.iter().max_by_key(|(_, a)| a.voxel_means(1.0).len()).map(|(label, _)| *label);
-        let root = self.settings.root.or(largest).unwrap_or_else(|| unused_label(&posed));
-        let mut learner = Learner::new(root, self.settings.use_tool, accumulators);
-        learner.settings = self.settings.kinematics;
-        learner.sampling = self.settings.sampling;
-        learner.kept_windows = self.settings.windows.kept;
-        learner.root_is_given = self.settings.root.is_some();
-        learner.dynamics = DynamicsLearner::new(self.gravity_in_work()).declaring(self.settings.declared.clone());
-        learner.calibrate(&self.reference);
-        learner.world = (self.settings.root.is_none() && largest.is_none()).then_some(root);
-        for (label, part) in posed {
-            learner.add_posed(label, part);
-        }
-        self.reference.clear();
-        self.learner = Some(Arc::new(learner));
     }
 
     /// A window that closed is learned here, or handed out if live.
-    fn close(&mut self, job: WindowJob) -> Option<Output> {
+    fn close(&mut self, window: CutWindow) -> Option<Output> {
+        if self.settings.live && self.scoring.is_none() {
+            let begin = match (&self.learner, &self.first_look) {
+                (Some(learner), _) => Begin::Learner(Arc::clone(learner)),
+                (None, Some(look)) => Begin::FirstLook(Arc::clone(look)),
+                (None, None) => return None,
+            };
+            self.closed_windows += 1;
+            self.handed_out.push_back((self.closed_windows, self.current.clone()));
+            return Some(Output::WindowClosed(Box::new(ClosedWindow::new(self.closed_windows, window, begin))));
+        }
         let learner = self.learner.as_mut()?;
+        let job = window.job(nearest_label);
         if let Some(scoring) = &mut self.scoring {
             let learner = Arc::make_mut(learner);
             scoring.score(learner, &job);
             self.current.extend(learner.displacements.iter().map(|(l, d)| (*l, *d)));
             return None;
-        }
-        if self.settings.live {
-            self.closed_windows += 1;
-            self.handed_out.push_back((self.closed_windows, self.current.clone()));
-            let window = ClosedWindow::new(self.closed_windows, job, Arc::clone(learner));
-            return Some(Output::WindowClosed(Box::new(window)));
         }
         Arc::make_mut(learner).learn(&job);
         self.current.extend(learner.displacements.iter().map(|(l, d)| (*l, *d)));
@@ -383,8 +431,9 @@ impl Pipeline {
             self.current.insert(*label, since * *learned_pose);
         }
         self.learner = Some(Arc::clone(&learned.learner));
+        (self.first_look, self.preview) = (None, None);
         if let Some(forecaster) = &mut self.forecaster {
-            forecaster.learned(&learned.learner, Some(&self.current));
+            forecaster.learned(&learned.learner, learned.mechanism.clone(), Some(&self.current));
         }
         Output::Learned { span_s: learned.span_s }
     }
@@ -392,7 +441,7 @@ impl Pipeline {
     /// Registers every part of a frame, from where it was.
     fn observe(&mut self, frame: &Frame) -> Vec<Output> {
         let mut outputs = self.observe_poses(frame);
-        let Some(learner) = &self.learner else {
+        let Some(learner) = self.tracked_with().cloned() else {
             outputs.extend(frame.scans.keys().map(|label| Output::Observation {
                 time_s: frame.time_s,
                 label: *label,
@@ -428,7 +477,7 @@ impl Pipeline {
     /// What pose topics measured in a frame; until the first window opens, since the first frame.
     fn observe_poses(&self, frame: &Frame) -> Vec<Output> {
         let learned = |label| self.learner.as_ref().and_then(|learner| learner.posed.get(label)).copied();
-        let first = self.reference.first().unwrap_or(frame);
+        let first = self.frames_at_rest().first().unwrap_or(frame);
         let outputs = frame.poses.iter().map(|(label, seen)| {
             let seen_first = || first.poses.get(label).unwrap_or(seen);
             let part = learned(label).unwrap_or_else(|| {
@@ -443,7 +492,7 @@ impl Pipeline {
     /// Whether a part is seen away from where it was a few frames ago: the older pose must explain
     /// the cloud clearly worse, so that a panel that slides along itself unseen does not count.
     fn something_moves(&self, frame: &Frame) -> bool {
-        let (Some(learner), Some(before)) = (&self.learner, self.recent.first()) else { return false };
+        let (Some(learner), Some(before)) = (self.tracked_with(), self.recent.first()) else { return false };
         frame.scans.iter().any(|(label, scan)| {
             let (Some(model), Some(old), Some(new)) =
                 (learner.models.get(label), before.get(label), self.current.get(label))
@@ -472,9 +521,4 @@ fn nearest_label(place: &Vector3<f64>, frame: &Frame) -> Option<Label> {
         }))
         .min_by(|a, b| a.0.total_cmp(&b.0))
         .map(|(_, label)| label)
-}
-
-/// A name for the world, where it is none of the parts.
-fn unused_label(parts: &BTreeMap<Label, PosedPart>) -> Label {
-    (0..).map(Label).find(|label| !parts.contains_key(label)).unwrap_or_default()
 }

@@ -33,7 +33,7 @@ impl Pipeline {
             return Some(learner.posterior());
         }
         let mut parts = Parts { surfaces: self.surfaces_in_work(), origins: BTreeMap::new() };
-        let posed = self.reference.iter().rev().flat_map(|frame| &frame.poses);
+        let posed = self.frames_at_rest().iter().rev().flat_map(|frame| &frame.poses);
         parts.origins = posed.map(|(label, seen)| (*label, seen.world_from_frame.translation)).collect();
         let likeliest = || parts.surfaces.iter().max_by_key(|(_, points)| points.len()).map(|(label, _)| *label);
         let root = self.settings.root.or_else(likeliest).or_else(|| parts.origins.keys().next().copied())?;
@@ -45,7 +45,7 @@ impl Pipeline {
         if let Some(learner) = &self.learner {
             return learner.surfaces();
         }
-        let last = self.reference.last().into_iter().flat_map(|frame| &frame.scans);
+        let last = self.frames_at_rest().last().into_iter().flat_map(|frame| &frame.scans);
         last.map(|(label, scan)| (*label, scan.iter().map(|p| p.point_in_world).collect())).collect()
     }
 }

@@ -230,7 +230,9 @@ impl Learner {
             let cost = truncated_cost(model, scan, scan.len() / 150, &displacement);
             (cost - usual > UNEXPLAINED.min(0.5 * (OUTLIER_COST - usual))).then_some(*label)
         };
-        let unseen = Some(self.root).filter(|root| !frame.scans.contains_key(root));
+        // A name for the world is nothing to be seen.
+        let known = self.reference.contains_key(&self.root);
+        let unseen = Some(self.root).filter(|root| known && !frame.scans.contains_key(root));
         frame.scans.iter().filter_map(off).chain(unseen).collect()
     }
 

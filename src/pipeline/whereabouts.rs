@@ -21,10 +21,14 @@ const SCAN_STEPS: usize = 6;
 const SCAN_POINTS: usize = 500;
 /// A pose that explains a scan badly may be off by this per unit of excess \[m\].
 const DOUBT: f64 = 0.03;
+/// Excess beyond which a registered pose does not explain its scan: it is looked for further away.
+const BADLY_EXPLAINED: f64 = 0.6;
 /// Registered poses further apart than this are not one motion \[m\].
 const JUMP: f64 = 0.02;
 /// Registered poses are kept for so long \[s\].
 const KEPT: f64 = 0.6;
+/// A scan's mean goes this far by what of the part is seen \[m\].
+const MEAN_WENT: f64 = 0.02;
 /// A scan that is lost is looked for this far turned away from where it was \[rad\].
 const TURN: f64 = 0.25;
 
@@ -45,6 +49,8 @@ pub(super) struct Whereabouts {
     presences: BTreeMap<Label, Presence>,
     /// Parts as registration follows them where nothing else explains them.
     scan_poses: BTreeMap<Label, Vec<(f64, Pose)>>,
+    /// Means of the parts' last scans \[m\].
+    means: BTreeMap<Label, Vector3<f64>>,
     /// Where parts were left.
     places: BTreeMap<Label, Pose>,
 }
@@ -114,10 +120,12 @@ impl Whereabouts {
             let poses = self.scan_poses.entry(label).or_default();
             let known = joint.unwrap_or(place);
             let excess = |pose: &Pose| truncated_cost(model, scan, scan.len() / 150, pose) - usual;
+            let went = mean - self.means.insert(label, mean).unwrap_or(mean);
             let pose = if excess(&known) < WELL_EXPLAINED {
                 known
             } else {
-                register(model, scan, poses, frame.time_s, &known, tool)
+                let clues = Clues { now_s: frame.time_s, known: &known, tool, went, usual };
+                register(model, scan, poses, &clues)
             };
             if poses.last().is_some_and(|(_, last)| pose == known && travel(model, last, &pose) > JUMP) {
                 poses.clear();
@@ -161,23 +169,36 @@ impl Whereabouts {
             if let Some((least, q)) = found.min_by(|a, b| a.0.total_cmp(&b.0))
                 && least - usual < 0.5 * presence.excess(Account::Joint).unwrap_or(0.0)
             {
-                filter.place(body, q);
+                // It may coast on: registration has followed it meanwhile.
+                let poses = self.scan_poses.get(&label).map_or(&[][..], Vec::as_slice);
+                let free = FreePart::followed(poses, model.centroid, model.radius, &[]);
+                filter.place(body, q, 0.0);
+                let center = free.displacement.transform_point(&filter.mechanism().centers[body]);
+                let rate = filter.rate_of(body, &free.velocity_at(&center));
+                filter.place(body, q, rate);
                 presence.clear(Account::Joint);
             }
         }
     }
 }
 
-/// A scan's pose by registration from where it was, from where its motion led, and from where the tool
-/// took it; if none of these explains it, from turned ones as well.
-fn register(
-    model: &PartModel,
-    scan: &[ScanPoint],
-    poses: &[(f64, Pose)],
+/// What says where a scan's part may have gone.
+struct Clues<'a> {
     now_s: f64,
-    known: &Pose,
-    tool: &[(f64, Vector3<f64>)],
-) -> Pose {
+    /// Where it was expected.
+    known: &'a Pose,
+    /// The tool's positions, if it holds it.
+    tool: &'a [(f64, Vector3<f64>)],
+    /// How far the mean of its scan went since the last \[m\].
+    went: Vector3<f64>,
+    /// What its scans cost where its pose is known.
+    usual: f64,
+}
+
+/// A scan's pose by registration from where it was, from where its motion led, and from where the tool or
+/// its scan's mean went; if none of these explains it, from turned ones as well.
+fn register(model: &PartModel, scan: &[ScanPoint], poses: &[(f64, Pose)], clues: &Clues<'_>) -> Pose {
+    let Clues { now_s, known, tool, went, usual } = clues;
     let points: Vec<ScanPoint> = scan.iter().step_by((scan.len() / SCAN_POINTS).max(1)).copied().collect();
     let r = model.radius;
     let prior = Matrix6::from_diagonal(&(Vector6::new(r * r, r * r, r * r, 1.0, 1.0, 1.0) * SCAN_PRIOR));
@@ -186,7 +207,7 @@ fn register(
     let Some(&(then_s, last)) = poses.last() else { return fit(known).displacement };
     let mut starts = vec![last];
     let followed = FreePart::followed(poses, model.centroid, model.radius, &[]);
-    let ahead = followed.after(now_s - then_s).0;
+    let ahead = followed.after(*now_s - then_s).0;
     if travel(model, &last, &ahead) > 0.002 {
         starts.push(ahead);
     }
@@ -194,12 +215,16 @@ fn register(
     if let (Some((_, from)), Some((_, to))) = (before, tool.last()) {
         starts.push(Pose::from_translation(to - from) * last);
     }
+    // Between two frames a part can go further than points are matched.
+    if went.norm() > MEAN_WENT {
+        starts.push(Pose::from_translation(*went) * last);
+    }
     let best = |starts: &[Pose]| {
         let fitted = starts.iter().map(|start| fit(start).displacement).map(|pose| (cost(&pose), pose));
         fitted.min_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((f64::INFINITY, last))
     };
     let (least, pose) = best(&starts);
-    if least < 2.0 * crate::registration::OUTLIER_COST / 3.0 {
+    if least - usual < BADLY_EXPLAINED {
         return pose;
     }
     let center = Pose::from_translation(model.centroid);
@@ -211,7 +236,7 @@ fn register(
             turn[i / 2] = if i % 2 == 0 { TURN } else { -TURN };
             last * center * Pose::exp(&turn) * Pose::from_translation(-model.centroid)
         })
-        .chain([*known, last])
+        .chain([**known, last])
         .collect();
     let (other, far) = best(&turned);
     if other < least { far } else { pose }

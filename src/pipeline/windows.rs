@@ -11,6 +11,9 @@ use crate::model::Contact;
 use crate::registration::ScanPoint;
 use crate::types::{AppliedWrench, Label, SegmentedCloud, Stamp};
 
+/// Frames of a window are this far apart at least \[s\]: registration's errors are shared by frames that are
+/// closer, which cost time and memory all the same.
+const FRAME_SPACING: f64 = 0.06;
 /// A torque without force counts as the force that makes it at this lever \[m\].
 const TORQUE_LEVER: f64 = 0.1;
 
@@ -95,14 +98,27 @@ pub fn frame_of(time_s: f64, clouds: &[SegmentedCloud], most_points: usize) -> F
     frame
 }
 
-/// Cuts the stream into interaction windows.
-#[derive(Debug)]
-pub struct WindowCutter {
+/// Readings of the wrenches, and what they read at rest.
+#[derive(Clone, Debug)]
+struct Readings {
     settings: WindowSettings,
     zero: Stamp,
     wrenches: VecDeque<AppliedWrench>,
     /// Rest readings by source, while nothing is touched or moves: force \[N\], torque \[N·m\].
     rest: BTreeMap<usize, [Vector3<f64>; 2]>,
+}
+
+/// A window that closed, as it was cut from the stream: what was touched is still to be found.
+#[derive(Clone, Debug)]
+pub struct CutWindow {
+    frames: Vec<Frame>,
+    readings: Readings,
+}
+
+/// Cuts the stream into interaction windows.
+#[derive(Debug)]
+pub struct WindowCutter {
+    readings: Readings,
     frames: VecDeque<Frame>,
     open_since: Option<f64>,
     last_contact_s: f64,
@@ -112,10 +128,7 @@ impl WindowCutter {
     /// A cutter for a stream with the given time zero.
     pub fn new(settings: WindowSettings, zero: Stamp) -> Self {
         Self {
-            settings,
-            zero,
-            wrenches: VecDeque::new(),
-            rest: BTreeMap::new(),
+            readings: Readings { settings, zero, wrenches: VecDeque::new(), rest: BTreeMap::new() },
             frames: VecDeque::new(),
             open_since: None,
             last_contact_s: f64::NEG_INFINITY,
@@ -129,17 +142,125 @@ impl WindowCutter {
 
     /// Adds a wrench reading.
     pub fn push_wrench(&mut self, wrench: AppliedWrench) {
-        self.wrenches.push_back(wrench);
-    }
-
-    fn time(&self, wrench: &AppliedWrench) -> f64 {
-        wrench.stamp.seconds_since(self.zero)
+        self.readings.wrenches.push_back(wrench);
     }
 
     /// Rest reading of the force of a tool \[N\].
     pub fn rest_force(&self) -> Option<Vector3<f64>> {
-        let tool = self.wrenches.iter().find(|wrench| wrench.tool)?;
-        self.rest.get(&tool.source).map(|[force, _]| *force)
+        let tool = self.readings.wrenches.iter().find(|wrench| wrench.tool)?;
+        self.readings.rest.get(&tool.source).map(|[force, _]| *force)
+    }
+
+    /// Adds a frame; returns a window that closes with it. `moving`: whether a part still moves.
+    pub fn push_frame(&mut self, frame: Frame, moving: bool) -> Option<CutWindow> {
+        let now = frame.time_s;
+        let previous = self.frames.back().map_or(now - 0.1, |f| f.time_s);
+        if self.readings.rest.is_empty() {
+            self.readings.track_rest(now - 10.0, now);
+        }
+        // The newest reading may be younger than the cloud: look only up to the cloud.
+        let steps = 4;
+        let active = (1..=steps)
+            .map(|i| {
+                previous + (now - previous) * f64::from(i) / f64::from(steps) - 0.5 * self.readings.settings.smoothing_s
+            })
+            .any(|t| self.readings.active_at(t, None));
+        if active {
+            self.last_contact_s = now;
+        }
+        // Registration sees motion where there is none; a measured pose does not.
+        let opens = active || frame.moves;
+        let moving = moving || frame.moves;
+        self.frames.push_back(frame);
+        match self.open_since {
+            None if opens => self.open_since = Some(now),
+            None => {
+                self.readings.track_rest(previous, now);
+                self.forget(now - self.readings.settings.lead_s - 0.2);
+            }
+            Some(_) => {}
+        }
+        let opened = self.open_since?;
+        let settings = &self.readings.settings;
+        let quiet = now - self.last_contact_s >= settings.quiet_s && !moving;
+        (quiet || now - opened >= settings.longest_s).then(|| self.close(now))
+    }
+
+    /// The window that is open at the end of the stream.
+    pub fn flush(&mut self) -> Option<CutWindow> {
+        self.open_since?;
+        let now = self.frames.back()?.time_s;
+        Some(self.close(now))
+    }
+
+    /// Ends a record: a window that is open closes, and what comes is not joined to what was.
+    pub fn end_record(&mut self) -> Option<CutWindow> {
+        let window = self.flush();
+        self.frames.clear();
+        window
+    }
+
+    fn forget(&mut self, before_s: f64) {
+        while self.frames.front().is_some_and(|f| f.time_s < before_s) {
+            self.frames.pop_front();
+        }
+        let Readings { wrenches, zero, .. } = &mut self.readings;
+        while wrenches.front().is_some_and(|w| w.stamp.seconds_since(*zero) < before_s - 0.5) {
+            wrenches.pop_front();
+        }
+    }
+
+    fn close(&mut self, now: f64) -> CutWindow {
+        self.open_since = None;
+        let last = self.frames.back().cloned();
+        let frames = spaced(self.frames.drain(..));
+        self.frames.extend(last);
+        let readings = self.readings.clone();
+        self.forget(now - 1.0);
+        CutWindow { frames, readings }
+    }
+}
+
+/// Frames that are [`FRAME_SPACING`] apart at least, the first and the last among them.
+fn spaced(frames: impl Iterator<Item = Frame>) -> Vec<Frame> {
+    let mut kept: Vec<Frame> = Vec::new();
+    let mut between = None;
+    for frame in frames {
+        if kept.last().is_none_or(|before| frame.time_s - before.time_s >= FRAME_SPACING) {
+            kept.push(frame);
+            between = None;
+        } else {
+            between = Some(frame);
+        }
+    }
+    if let Some(last) = between {
+        // It stands for the one before it, which it is too near to.
+        if kept.len() > 1 {
+            kept.pop();
+        }
+        kept.push(last);
+    }
+    kept
+}
+
+impl CutWindow {
+    /// Seconds since time zero of its first and last frame.
+    pub fn span_s(&self) -> (f64, f64) {
+        let time = |frame: Option<&Frame>| frame.map_or(0.0, |frame| frame.time_s);
+        (time(self.frames.first()), time(self.frames.last()))
+    }
+
+    /// The window with the tools' contacts, by which parts are `nearest` to them.
+    pub fn job(self, nearest: impl Fn(&Vector3<f64>, &Frame) -> Option<Label>) -> WindowJob {
+        let contacts = self.readings.contacts(&self.frames, nearest);
+        let Readings { wrenches, zero, .. } = self.readings;
+        WindowJob { frames: self.frames, contacts, wrenches: wrenches.into(), zero }
+    }
+}
+
+impl Readings {
+    fn time(&self, wrench: &AppliedWrench) -> f64 {
+        wrench.stamp.seconds_since(self.zero)
     }
 
     /// Whether a source is beyond its rest reading at a time, smoothed; `None`: any source. What no tool
@@ -184,81 +305,6 @@ impl WindowCutter {
             let rest = self.rest.entry(source).or_insert(mean);
             *rest = [rest[0] * 0.9 + mean[0] * 0.1, rest[1] * 0.9 + mean[1] * 0.1];
         }
-    }
-
-    /// Adds a frame; returns a window that closes with it. `moving`: whether a part still moves.
-    pub fn push_frame(
-        &mut self,
-        frame: Frame,
-        moving: bool,
-        nearest: impl Fn(&Vector3<f64>, &Frame) -> Option<Label>,
-    ) -> Option<WindowJob> {
-        let now = frame.time_s;
-        let previous = self.frames.back().map_or(now - 0.1, |f| f.time_s);
-        if self.rest.is_empty() {
-            self.track_rest(now - 10.0, now);
-        }
-        // The newest reading may be younger than the cloud: look only up to the cloud.
-        let steps = 4;
-        let active = (1..=steps)
-            .map(|i| previous + (now - previous) * f64::from(i) / f64::from(steps) - 0.5 * self.settings.smoothing_s)
-            .any(|t| self.active_at(t, None));
-        if active {
-            self.last_contact_s = now;
-        }
-        // Registration sees motion where there is none; a measured pose does not.
-        let opens = active || frame.moves;
-        let moving = moving || frame.moves;
-        self.frames.push_back(frame);
-        match self.open_since {
-            None if opens => self.open_since = Some(now),
-            None => {
-                self.track_rest(previous, now);
-                self.forget(now - self.settings.lead_s - 0.2);
-            }
-            Some(_) => {}
-        }
-        let opened = self.open_since?;
-        let quiet = now - self.last_contact_s >= self.settings.quiet_s && !moving;
-        if quiet || now - opened >= self.settings.longest_s {
-            return Some(self.close(now, nearest));
-        }
-        None
-    }
-
-    /// The window that is open at the end of the stream.
-    pub fn flush(&mut self, nearest: impl Fn(&Vector3<f64>, &Frame) -> Option<Label>) -> Option<WindowJob> {
-        self.open_since?;
-        let now = self.frames.back()?.time_s;
-        Some(self.close(now, nearest))
-    }
-
-    /// Ends a record: a window that is open closes, and what comes is not joined to what was.
-    pub fn end_record(&mut self, nearest: impl Fn(&Vector3<f64>, &Frame) -> Option<Label>) -> Option<WindowJob> {
-        let job = self.flush(nearest);
-        self.frames.clear();
-        job
-    }
-
-    fn forget(&mut self, before_s: f64) {
-        while self.frames.front().is_some_and(|f| f.time_s < before_s) {
-            self.frames.pop_front();
-        }
-        while self.wrenches.front().is_some_and(|w| w.stamp.seconds_since(self.zero) < before_s - 0.5) {
-            self.wrenches.pop_front();
-        }
-    }
-
-    fn close(&mut self, now: f64, nearest: impl Fn(&Vector3<f64>, &Frame) -> Option<Label>) -> WindowJob {
-        self.open_since = None;
-        let frames: Vec<Frame> = self.frames.drain(..).collect();
-        let contacts = self.contacts(&frames, nearest);
-        let wrenches = self.wrenches.iter().copied().collect();
-        if let Some(last) = frames.last() {
-            self.frames.push_back(last.clone());
-        }
-        self.forget(now - 1.0);
-        WindowJob { frames, contacts, wrenches, zero: self.zero }
     }
 
     /// Each tool's contact, by the part that it was nearest to.
@@ -315,5 +361,25 @@ impl WindowCutter {
         let variance = residual / (3.0 * (samples.len() as f64 - 3.0).max(1.0));
         let sigma = (variance * inverse[(0, 0)]).sqrt().max(0.0003);
         Some((solution.row(0).transpose(), sigma))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn times(rate_hz: f64, count: usize) -> Vec<f64> {
+        let frame = |k: usize| Frame { time_s: k as f64 / rate_hz, ..Frame::default() };
+        spaced((0..count).map(frame)).iter().map(|frame| frame.time_s).collect()
+    }
+
+    #[test]
+    fn frames_that_come_fast_are_thinned_out_from_the_first_to_the_last() {
+        assert_eq!(times(10.0, 5).len(), 5);
+        assert_eq!(times(15.0, 5).len(), 5);
+        let found = times(30.0, 8);
+        assert_eq!(found.len(), 4, "{found:?}");
+        assert!(found[0] == 0.0 && (found[3] - 7.0 / 30.0).abs() < 1e-12, "{found:?}");
+        assert_eq!(times(60.0, 2).len(), 2);
     }
 }

@@ -1,25 +1,37 @@
-//! Learning beside the stream: a window that closed goes to a worker, what it learned comes back.
+//! Learning beside the stream: a window that closed goes to a worker, what it learned comes back, all that
+//! the stream needs of it made up beforehand.
 //!
 //! Replay learns in the stream, as time stands still there; a live stream does not wait.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use super::forecast::mechanism_of;
+use super::windows::CutWindow;
 use super::working_frame::hulls;
-use super::{Learner, WindowJob};
+use super::{FirstLook, Learner, nearest_label};
 use crate::geometry::HullProperties;
 use crate::math::Pose;
+use crate::tracking::TrackedMechanism;
 use crate::types::Label;
 use crate::types::posterior::ObjectPosterior;
+
+/// Where a worker begins that has learned nothing yet.
+#[derive(Clone)]
+pub(super) enum Begin {
+    /// What was adopted when the window closed.
+    Learner(Arc<Learner>),
+    /// Nothing was; the object as it was first seen.
+    FirstLook(Arc<FirstLook>),
+}
 
 /// A window that closed, with what a worker needs to learn it.
 #[derive(Clone)]
 pub struct ClosedWindow {
     /// Counts the windows handed out.
     pub(super) sequence: u64,
-    job: WindowJob,
-    /// What was adopted when it closed: where a worker begins that has learned nothing yet.
-    learner: Arc<Learner>,
+    window: CutWindow,
+    begin: Begin,
     world_from_work: Pose,
 }
 
@@ -30,8 +42,8 @@ impl std::fmt::Debug for ClosedWindow {
 }
 
 impl ClosedWindow {
-    pub(super) fn new(sequence: u64, job: WindowJob, learner: Arc<Learner>) -> Self {
-        Self { sequence, job, learner, world_from_work: Pose::identity() }
+    pub(super) fn new(sequence: u64, window: CutWindow, begin: Begin) -> Self {
+        Self { sequence, window, begin, world_from_work: Pose::identity() }
     }
 
     pub(super) fn carried_out(self, world_from_work: &Pose) -> Self {
@@ -40,7 +52,7 @@ impl ClosedWindow {
 
     /// Seconds since time zero of its first and last frame.
     pub fn span_s(&self) -> (f64, f64) {
-        self.job.span_s()
+        self.window.span_s()
     }
 }
 
@@ -57,6 +69,8 @@ pub struct Learned {
     pub(super) sequence: u64,
     /// Everything learned so far, for [`Pipeline::adopt`](super::Pipeline::adopt).
     pub learner: Arc<Learner>,
+    /// Its joints, as tracking needs them; `None` without any.
+    pub(super) mechanism: Option<Arc<TrackedMechanism>>,
     /// Seconds since time zero of the window's first and last frame.
     pub span_s: (f64, f64),
     /// What is believed now, in world.
@@ -67,6 +81,14 @@ pub struct Learned {
     pub ranges_seen: BTreeMap<Label, (f64, f64)>,
 }
 
+/// Models of the parts as they were first seen, for [`Pipeline::adopt_models`](super::Pipeline::adopt_models).
+#[derive(Clone)]
+pub struct Looked {
+    pub(super) learner: Arc<Learner>,
+    /// Whether of the whole first look.
+    pub(super) whole: bool,
+}
+
 /// Learns windows one after the other, in the order they closed.
 #[derive(Default)]
 pub struct Worker {
@@ -74,15 +96,32 @@ pub struct Worker {
 }
 
 impl Worker {
+    /// Makes the models of the parts as they were first seen.
+    pub fn look(&mut self, look: &FirstLook) -> Looked {
+        let learner = match &self.learner {
+            Some(learner) => Arc::clone(learner),
+            None => Arc::new(look.learner()),
+        };
+        if look.whole {
+            self.learner = Some(Arc::clone(&learner));
+        }
+        Looked { learner, whole: look.whole }
+    }
+
     /// Learns one window.
-    pub fn learn(&mut self, window: &ClosedWindow) -> Learned {
-        let learner = self.learner.get_or_insert_with(|| Arc::clone(&window.learner));
+    pub fn learn(&mut self, window: ClosedWindow) -> Learned {
+        let learner = self.learner.get_or_insert_with(|| match &window.begin {
+            Begin::Learner(learner) => Arc::clone(learner),
+            Begin::FirstLook(look) => Arc::new(look.learner()),
+        });
+        let span_s = window.span_s();
         // The stream goes on with the one before meanwhile.
-        Arc::make_mut(learner).learn(&window.job);
+        Arc::make_mut(learner).learn(&window.window.job(nearest_label));
         Learned {
             sequence: window.sequence,
+            mechanism: mechanism_of(learner),
             learner: Arc::clone(learner),
-            span_s: window.span_s(),
+            span_s,
             posterior: learner.posterior().carried_by(&window.world_from_work),
             hulls: hulls(&learner.surfaces(), &window.world_from_work),
             ranges_seen: learner.ranges_seen(),

@@ -170,6 +170,11 @@ fn carried_output(output: Output, world_from_work: &Pose, begin_s: f64) -> Outpu
             let covariance_m2 = world_from_work.rotation * covariance_m2 * world_from_work.rotation.transpose();
             Output::Prediction { time_s: time_s - begin_s, horizon_s, label, displacement, covariance_m2 }
         }
+        Output::Tracked { time_s, label, displacement, twist } => {
+            let displacement = *world_from_work * displacement * world_from_work.inverse();
+            let twist = world_from_work.adjoint(&twist);
+            Output::Tracked { time_s: time_s - begin_s, label, displacement, twist }
+        }
         Output::WindowClosed(window) => Output::WindowClosed(Box::new(window.carried_out(world_from_work))),
         other => other,
     }

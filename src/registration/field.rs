@@ -44,20 +44,27 @@ impl NearestField {
 
     fn fill(&mut self, surfels: &[Surfel]) {
         let mut distances = vec![[f32::INFINITY; 2]; self.cells.len()];
-        let reach = (REACH / self.cell).floor() as i64;
+        let reach = REACH / self.cell;
+        let reach_squared = (reach * reach) as f32;
         for (index, surfel) in surfels.iter().enumerate() {
             let center = (surfel.point - self.origin) / self.cell;
-            let base = center.map(|x| x.floor() as i64);
-            for x in (base.x - reach).max(0)..=(base.x + reach).min(self.shape[0] as i64 - 1) {
-                for y in (base.y - reach).max(0)..=(base.y + reach).min(self.shape[1] as i64 - 1) {
-                    for z in (base.z - reach).max(0)..=(base.z + reach).min(self.shape[2] as i64 - 1) {
-                        let middle = Vector3::new(x as f64 + 0.5, y as f64 + 0.5, z as f64 + 0.5);
-                        let distance = (middle - center).norm() as f32;
-                        if f64::from(distance) * self.cell > REACH {
-                            continue;
-                        }
-                        let at = (x as usize * self.shape[1] + y as usize) * self.shape[2] + z as usize;
-                        insert(&mut self.cells[at], &mut distances[at], index as u32, distance, surfels);
+            // Cells within reach along an axis, with the distances of their middles.
+            let along = |axis: usize, reach: f64| {
+                let first = (center[axis] - 0.5 - reach).ceil().max(0.0) as usize;
+                let end = ((center[axis] - 0.5 + reach).floor() as usize + 1).min(self.shape[axis]);
+                (first..end).map(move |k| (k, (k as f64 + 0.5 - center[axis]) as f32))
+            };
+            for (x, dx) in along(0, reach) {
+                for (y, dy) in along(1, reach) {
+                    let abreast = dx * dx + dy * dy;
+                    let left = reach_squared - abreast;
+                    if left < 0.0 {
+                        continue;
+                    }
+                    let row = (x * self.shape[1] + y) * self.shape[2];
+                    for (z, dz) in along(2, f64::from(left).sqrt()) {
+                        let (cell, distances) = (&mut self.cells[row + z], &mut distances[row + z]);
+                        insert(cell, distances, index as u32, abreast + dz * dz, surfels);
                     }
                 }
             }
@@ -78,7 +85,8 @@ impl NearestField {
     }
 }
 
-/// Keeps the nearest surfel of a cell, and the nearest facing the other way (normals over 90° apart).
+/// Keeps the nearest surfel of a cell, and the nearest facing the other way (normals over 90° apart), by the
+/// squares of their distances.
 fn insert(cell: &mut [u32; 2], distances: &mut [f32; 2], index: u32, distance: f32, surfels: &[Surfel]) {
     let opposed = |a: u32, b: u32| surfels[a as usize].normal.dot(&surfels[b as usize].normal) < 0.0;
     if distance < distances[0] {

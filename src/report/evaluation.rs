@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use crate::io::counters::Counters;
 use crate::io::document::DocumentError;
-use crate::pipeline::{PartScore, Scores};
+use crate::pipeline::{PartScore, Scores, StageScore};
 use crate::types::Label;
 use crate::types::finite::check_finite;
 
@@ -28,7 +28,34 @@ pub struct Evaluation {
     before: Vec<Residuals>,
     /// With what criticism added.
     after: Vec<Residuals>,
+    /// The models on the way from the one to the other, both included.
+    steps: Vec<Step>,
     counters: Counters,
+}
+
+/// One model.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+struct Step {
+    /// What it has beyond the declared physics.
+    effects: Vec<EffectName>,
+    residuals: Vec<Residuals>,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize)]
+struct EffectName {
+    name: &'static str,
+    label: Option<Label>,
+}
+
+impl Step {
+    fn of(stage: &StageScore) -> Self {
+        let effects = stage.effects.iter().map(|(label, name)| EffectName { name, label: *label });
+        Self { effects: effects.collect(), residuals: residuals_of(stage) }
+    }
+}
+
+fn residuals_of(stage: &StageScore) -> Vec<Residuals> {
+    stage.parts.iter().map(|(label, part)| Residuals::of(*label, part)).collect()
 }
 
 /// Root mean squares of one part.
@@ -45,17 +72,17 @@ struct Residuals {
 }
 
 impl Residuals {
-    fn of(label: Label, part: &PartScore, model: usize) -> Self {
-        let sum = &part.residuals[model];
-        let rms = |square: f64, count: usize| (count > 0).then(|| (square / count as f64).sqrt());
-        let force = rms(sum.force.0, sum.force.1);
+    fn of(label: Label, part: &PartScore) -> Self {
+        let rms = |square: f64, count: f64| (count > 0.0).then(|| (square / count).sqrt());
+        let force = rms(part.force.0, part.force.1);
+        let position = rms(part.position.0, part.position.1 as f64).unwrap_or_default();
         Self {
             label,
             scored_windows: part.windows,
             force_rmse_n: force.filter(|_| !part.turns),
             torque_rmse_nm: force.filter(|_| part.turns),
-            position_rmse_m: rms(sum.position.0, sum.position.1).unwrap_or_default(),
-            rotation_rmse_rad: rms(sum.rotation, sum.position.1).unwrap_or_default(),
+            position_rmse_m: if part.turns { position * part.radius_m } else { position },
+            rotation_rmse_rad: if part.turns { position } else { 0.0 },
         }
     }
 }
@@ -63,8 +90,7 @@ impl Residuals {
 impl Evaluation {
     /// From the scores of a bag.
     pub fn new(model: &str, bag: &str, was_learned: bool, horizon_s: f64, scores: &Scores, counters: Counters) -> Self {
-        let residuals =
-            |of: usize| scores.parts.iter().map(|(label, part)| Residuals::of(*label, part, of)).collect::<Vec<_>>();
+        let residuals = |stage: Option<&StageScore>| stage.map(residuals_of).unwrap_or_default();
         Self {
             schema: SCHEMA,
             model: model.to_owned(),
@@ -72,8 +98,9 @@ impl Evaluation {
             was_learned,
             horizon_s,
             windows: scores.windows,
-            before: residuals(0),
-            after: residuals(1),
+            before: residuals(scores.stages.first()),
+            after: residuals(scores.stages.last()),
+            steps: scores.stages.iter().map(Step::of).collect(),
             counters,
         }
     }
@@ -97,10 +124,13 @@ pub fn table(evaluation: &Evaluation) -> String {
     let mut text =
         format!("{bag}: {windows} window{plural}, scored by {model} over {horizon_s} s, nothing learned\n\n");
     let _ = writeln!(text, "part  windows   position   rotation        force");
-    for (before, after) in evaluation.before.iter().zip(&evaluation.after) {
+    for (row, before) in evaluation.before.iter().enumerate() {
         let _ = writeln!(text, "{:>4}  {:>7}  {}", before.label.0, before.scored_windows, columns(before));
-        if after != before {
-            let _ = writeln!(text, "{:>13}  {}  with effects", "", columns(after));
+        for step in evaluation.steps.iter().skip(1) {
+            if let Some(residuals) = step.residuals.get(row) {
+                let names: Vec<&str> = step.effects.iter().map(|effect| effect.name).collect();
+                let _ = writeln!(text, "{:>13}  {}  with {}", "", columns(residuals), names.join(", "));
+            }
         }
     }
     if evaluation.before.is_empty() {
@@ -125,27 +155,32 @@ fn columns(residuals: &Residuals) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tracking::ResidualSum;
 
     #[test]
-    fn a_part_is_a_line_and_effects_are_another() {
-        let sum = ResidualSum { force: (0.5, 2), position: (4e-6, 4), rotation: 0.0 };
-        let less = ResidualSum { force: (0.02, 2), ..sum };
-        let part = |residuals, turns| PartScore { windows: 2, turns, residuals };
-        let parts = [(Label(1), part([sum, less], false)), (Label(5), part([sum, sum], true))].into_iter().collect();
-        let scores = Scores { windows: 3, parts };
+    fn a_part_is_a_line_and_every_model_with_effects_another() {
+        let slide = PartScore { windows: 2, force: (0.5, 2.0), position: (4e-6, 4), ..PartScore::default() };
+        let hinge = PartScore { turns: true, radius_m: 0.5, ..slide.clone() };
+        let stage = |effects: &[(Option<Label>, &'static str)], parts: [PartScore; 2]| StageScore {
+            effects: effects.to_vec(),
+            parts: [Label(1), Label(5)].into_iter().zip(parts).collect(),
+        };
+        let less = PartScore { force: (0.02, 2.0), ..slide.clone() };
+        let stages = vec![stage(&[], [slide, hinge.clone()]), stage(&[(Some(Label(1)), "spring")], [less, hinge])];
+        let scores = Scores { windows: 3, stages };
         let evaluation = Evaluation::new("m.json", "a.mcap", true, 1.0, &scores, Counters::default());
         let expected = "a.mcap: 3 windows, scored by m.json over 1 s, nothing learned
 
 part  windows   position   rotation        force
    1        2    1.00 mm     0.000°      0.500 N
-                 1.00 mm     0.000°      0.100 N  with effects
-   5        2    1.00 mm     0.000°    0.500 N·m
+                 1.00 mm     0.000°      0.100 N  with spring
+   5        2    0.50 mm     0.057°    0.500 N·m
+                 0.50 mm     0.057°    0.500 N·m  with spring
 ! the model has learned this bag: these are residuals, not predictions
 ";
         assert_eq!(table(&evaluation), expected);
         let value = serde_json::to_value(&evaluation).unwrap();
         assert_eq!(value["before"][1]["torque_rmse_Nm"], 0.5);
         assert!(value["before"][1].get("force_rmse_N").is_none());
+        assert_eq!(value["steps"][1]["effects"][0]["name"], "spring");
     }
 }

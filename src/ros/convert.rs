@@ -67,6 +67,8 @@ pub struct PartPrediction {
     pub center_in_world: Vector3<f64>,
     /// Covariance of D·c \[m²\].
     pub covariance_m2: Matrix3<f64>,
+    /// Position of its joint in the description \[m or rad\]; `None` where it has none that moves, or floats.
+    pub joint_position: Option<f64>,
 }
 
 /// Where the wrench to come is from.
@@ -227,6 +229,7 @@ fn predicted_pose(prediction: &PartPrediction) -> messages::PredictedPartPose {
         center: point(&prediction.displacement.transform_point(&prediction.center_in_world)),
         // Symmetric, so that rows and columns are the same.
         center_covariance: std::array::from_fn(|i| prediction.covariance_m2[i]),
+        joint_position: prediction.joint_position.into_iter().collect(),
     }
 }
 

@@ -4,9 +4,9 @@
 //! the stream; its origin is on the joint's axis if that is revolute, else at the part's centre of mass.
 //! So `world_from_link = D_link · T(origin)` with `D_child = D_parent · exp(S q)`.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
-use nalgebra::{DMatrix, Vector3};
+use nalgebra::{DMatrix, Vector3, Vector6};
 
 use crate::math::{Pose, Screw};
 use crate::structure::TreeDistribution;
@@ -17,6 +17,8 @@ use crate::types::posterior::{EdgePosterior, JointTypeProbabilities, ObjectPoste
 /// the second, else to the root.
 const UNDECIDED: f64 = 0.5;
 const DECIDED_PARENT: f64 = 0.9;
+/// A part is not where its joint could have it, that far off \[m\] or turned \[rad\].
+const OFF_JOINT: f64 = 5e-4;
 /// An axis shorter than this has no direction.
 const SHORT: f64 = 1e-6;
 
@@ -25,6 +27,8 @@ const SHORT: f64 = 1e-6;
 pub enum LinkJoint {
     /// Not at all, or nothing is known.
     Fixed,
+    /// Anyhow: it is not where a joint could have it. In the fixed frame, as tf says.
+    Floating,
     /// Along a unit vector.
     Prismatic {
         /// The axis.
@@ -58,14 +62,14 @@ impl LinkJoint {
     /// The unit vector of its axis.
     pub fn direction(&self) -> Option<Vector3<f64>> {
         match self {
-            Self::Fixed => None,
+            Self::Fixed | Self::Floating => None,
             Self::Prismatic { direction } | Self::Revolute { direction, .. } => Some(*direction),
         }
     }
 
     fn screw(&self) -> Screw {
         match self {
-            Self::Fixed => Screw::rigid(),
+            Self::Fixed | Self::Floating => Screw::rigid(),
             Self::Prismatic { direction } => Screw::prismatic(direction),
             Self::Revolute { direction, point } => Screw::revolute(direction, point),
         }
@@ -75,7 +79,7 @@ impl LinkJoint {
     /// are the same, the nearest to this. `origin`: whose way along a prismatic axis counts.
     fn position(&self, relative: &Pose, origin: &Vector3<f64>, near: f64) -> Option<f64> {
         match self {
-            Self::Fixed => None,
+            Self::Fixed | Self::Floating => None,
             Self::Prismatic { direction } => Some(direction.dot(&(relative.transform_point(origin) - origin))),
             Self::Revolute { direction, .. } => Some(relative.turn_about(direction, near)),
         }
@@ -99,7 +103,7 @@ pub struct Link {
 }
 
 /// Links, parents first; the root is the first.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct LinkTree {
     links: Vec<Link>,
 }
@@ -146,7 +150,7 @@ impl LinkTree {
             let joint = edge.map_or(LinkJoint::Fixed, |edge| LinkJoint::of(&posterior.edges[edge]));
             let origin = match joint {
                 LinkJoint::Revolute { point, .. } => point,
-                LinkJoint::Fixed | LinkJoint::Prismatic { .. } => center(nodes[node]),
+                LinkJoint::Fixed | LinkJoint::Floating | LinkJoint::Prismatic { .. } => center(nodes[node]),
             };
             let parent = place.get(&parents[node]).copied();
             place.insert(node, links.len());
@@ -193,6 +197,55 @@ impl LinkTree {
             Some((link.label, link.joint.position(&relative, &link.origin, near)?))
         });
         found.filter(|(_, q)| q.is_finite()).collect()
+    }
+}
+
+impl LinkTree {
+    /// The parts that are not where the tree could have them, of these displacements; what hangs on such a
+    /// part is looked at from where that is. Parts without a displacement stand still.
+    pub fn off_joint(&self, displacements: &BTreeMap<Label, Pose>) -> BTreeSet<Label> {
+        let mut off = BTreeSet::new();
+        let mut placed: Vec<Pose> = Vec::with_capacity(self.links.len());
+        for link in &self.links {
+            let seen = displacements.get(&link.label).copied().unwrap_or_else(Pose::identity);
+            let above = link.parent.map_or_else(Pose::identity, |parent| placed[parent]);
+            let relative = above.inverse() * seen;
+            let q = link.joint.position(&relative, &link.origin, 0.0).unwrap_or_default();
+            let by_joint = above * link.joint.screw().displacement(q);
+            let apart = (by_joint.transform_point(&link.origin) - seen.transform_point(&link.origin)).norm();
+            let turned = (by_joint.inverse() * seen).log().fixed_rows::<3>(0).norm();
+            if link.joint == LinkJoint::Floating || apart.max(turned) > OFF_JOINT {
+                off.insert(link.label);
+                placed.push(seen);
+            } else {
+                placed.push(by_joint);
+            }
+        }
+        off
+    }
+
+    /// This tree with some parts floating.
+    pub fn floating(&self, labels: &BTreeSet<Label>) -> Self {
+        let mut tree = self.clone();
+        for link in tree.links.iter_mut().filter(|link| labels.contains(&link.label)) {
+            (link.parent, link.joint, link.edge) = (None, LinkJoint::Floating, None);
+        }
+        tree
+    }
+
+    /// Rate of every joint that moves \[m/s or rad/s\], by child, from twists of the children against their
+    /// parents, (angular, linear), at the reference configuration; 0 for what is not given.
+    pub fn rates(&self, twists: &BTreeMap<Label, Vector6<f64>>) -> BTreeMap<Label, f64> {
+        let rate = |(link, _): (&Link, Vector3<f64>)| {
+            let twist = twists.get(&link.label).copied().unwrap_or_default();
+            let rate = match link.joint {
+                LinkJoint::Fixed | LinkJoint::Floating => 0.0,
+                LinkJoint::Prismatic { direction } => direction.dot(&twist.fixed_rows::<3>(3)),
+                LinkJoint::Revolute { direction, .. } => direction.dot(&twist.fixed_rows::<3>(0)),
+            };
+            (link.label, rate)
+        };
+        self.moving().map(rate).collect()
     }
 }
 
@@ -300,6 +353,37 @@ mod tests {
                 assert!((found[label] - q).abs() < 1e-12, "{label}: {q} {found:?}");
             }
         }
+    }
+
+    #[test]
+    fn what_is_off_its_joint_floats() {
+        let tree = LinkTree::likeliest(&door_with_drawer_and_handle());
+        let positions = BTreeMap::from([(Label(2), 1.0), (Label(3), 0.25), (Label(7), 0.3)]);
+        let mut displacements = tree.displacements(&positions);
+        assert_eq!(tree.off_joint(&displacements), BTreeSet::new());
+        // The door leaves its hinge with the handle on it.
+        let lifted = Pose::from_translation(Vector3::new(0.0, 0.01, 0.01));
+        for label in [Label(2), Label(7)] {
+            displacements.insert(label, lifted * displacements[&label]);
+        }
+        let off = tree.off_joint(&displacements);
+        assert_eq!(off, BTreeSet::from([Label(2)]));
+        let tree = tree.floating(&off);
+        assert_eq!(tree.moving().count(), 2);
+        let found = tree.positions(&displacements, &BTreeMap::new());
+        assert!((found[&Label(7)] - 0.3).abs() < 1e-12 && !found.contains_key(&Label(2)), "{found:?}");
+        assert_eq!(tree.off_joint(&displacements), off);
+    }
+
+    #[test]
+    fn rates_are_along_the_joints_own_axes() {
+        let tree = LinkTree::likeliest(&door_with_drawer_and_handle());
+        // The same door, its axis the other way round.
+        let LinkJoint::Revolute { direction, point } = tree.links()[2].joint else { panic!("{tree:?}") };
+        let twists = BTreeMap::from([(Label(2), Screw::revolute(&-direction, &point).0 * 0.7)]);
+        let rates = tree.rates(&twists);
+        assert!((rates[&Label(2)] + 0.7).abs() < 1e-12, "{rates:?}");
+        assert_eq!((rates.len(), rates[&Label(3)]), (3, 0.0));
     }
 
     #[test]

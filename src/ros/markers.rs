@@ -154,7 +154,7 @@ fn axis_markers(
     let edge = posterior.edges.get(link.edge?)?;
     let direction = link.joint.direction()?;
     let (color, covariance) = match link.joint {
-        LinkJoint::Fixed => return None,
+        LinkJoint::Fixed | LinkJoint::Floating => return None,
         LinkJoint::Prismatic { .. } => (PRISMATIC, prismatic_covariance(edge)?),
         LinkJoint::Revolute { .. } => (REVOLUTE, Matrix4::from(edge.revolute.as_ref()?.covariance)),
     };

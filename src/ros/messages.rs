@@ -171,6 +171,7 @@ pub struct PredictedPartPose {
     pub displacement: Transform,
     pub center: Point,
     pub center_covariance: [f64; 9],
+    pub joint_position: Vec<f64>,
 }
 
 /// msg/PredictedPartPoses.msg

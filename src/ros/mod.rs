@@ -15,5 +15,5 @@ pub use convert::{
 };
 pub use link_tree::{Link, LinkJoint, LinkTree, joint_name, link_name};
 pub use markers::{Picture, markers, no_markers};
-pub use motion::{joint_states, link_transforms, predicted_frame_name, predicted_transforms};
+pub use motion::{joint_states, link_transforms, place_joints, predicted_frame_name, predicted_transforms};
 pub use urdf::{Urdf, UrdfInput, urdf};

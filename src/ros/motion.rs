@@ -32,6 +32,21 @@ pub fn joint_states(
     }
 }
 
+/// Says of predictions where their joints are, each horizon by itself; parts that float have none.
+pub fn place_joints(tree: &LinkTree, predictions: &mut [PartPrediction]) {
+    let mut horizons: BTreeMap<u64, BTreeMap<Label, Pose>> = BTreeMap::new();
+    for prediction in &*predictions {
+        let parts = horizons.entry(prediction.horizon_s.to_bits()).or_default();
+        parts.insert(prediction.label, prediction.displacement);
+    }
+    let positions: BTreeMap<u64, BTreeMap<Label, f64>> =
+        horizons.iter().map(|(horizon, parts)| (*horizon, tree.positions(parts, &BTreeMap::new()))).collect();
+    for prediction in predictions {
+        let found = positions.get(&prediction.horizon_s.to_bits());
+        prediction.joint_position = found.and_then(|found| found.get(&prediction.label).copied());
+    }
+}
+
 /// The frame of a part's link as it will be in `horizon_s`.
 pub fn predicted_frame_name(label: Label, horizon_s: f64) -> String {
     format!("{}_in_{:.0}_ms", link_name(label), 1e3 * horizon_s)
@@ -131,6 +146,7 @@ mod tests {
             displacement: Pose::from_translation(Vector3::x()),
             center_in_world: Vector3::zeros(),
             covariance_m2: Matrix3::identity(),
+            joint_position: None,
         };
         let bad = PartPrediction { displacement: Pose::from_translation(Vector3::x() * f64::NAN), ..good };
         let unknown = PartPrediction { label: Label(99), ..good };

@@ -2,7 +2,7 @@
 //!
 //! The fixed frame is the root link, the root part is fixed to it. Where nothing is known of a part's
 //! joint it is fixed too, not floating: a planner may keep clear of what stands still, and needs no
-//! joint state for it. URDF cannot hold a mesh, only name a file; without a folder for meshes every part
+//! joint state for it. What is seen where no joint of the tree could have it floats. URDF cannot hold a mesh, only name a file; without a folder for meshes every part
 //! is a box.
 
 use std::collections::BTreeMap;
@@ -185,6 +185,7 @@ fn write_joint(text: &mut String, link: &Link, tree: &LinkTree, posterior: &Obje
         (LinkJoint::Revolute { .. }, Some((Some(lower), Some(upper)))) => ("revolute", Some((lower, upper))),
         (LinkJoint::Revolute { .. }, _) => ("continuous", None),
         (LinkJoint::Fixed, _) => ("fixed", None),
+        (LinkJoint::Floating, _) => ("floating", None),
     };
     line(text, 1, &format!("<joint name=\"{}\" type=\"{kind}\">", joint_name(link.label)));
     let at = link.origin - above.map_or_else(Vector3::zeros, |above| above.origin);
@@ -252,6 +253,25 @@ mod tests {
         assert!(text.contains("<joint name=\"joint_7\" type=\"continuous\">"), "{text}");
         assert!(text.contains("<joint name=\"joint_1\" type=\"fixed\">"), "{text}");
         assert_eq!(text.matches("<box").count(), 10);
+    }
+
+    #[test]
+    fn what_floats_hangs_on_the_fixed_frame() {
+        let posterior = examples::door_with_drawer_and_handle();
+        let (hulls, nothing) = (examples::hulls(), BTreeMap::new());
+        let input = UrdfInput { fixed_frame: "world", hulls: &hulls, ranges_seen: &nothing, mesh_folder: None };
+        let tree = LinkTree::likeliest(&posterior).floating(&[Label(2)].into());
+        let text = urdf(&tree, &posterior, &input).unwrap().text;
+        let origin = tree.links()[2].origin;
+        let door = format!(
+            "  <joint name=\"joint_2\" type=\"floating\">
+    <origin xyz=\"{}\" rpy=\"0 -0 0\"/>
+    <parent link=\"world\"/>
+    <child link=\"part_2\"/>
+  </joint>\n",
+            triple(&origin)
+        );
+        assert!(text.contains(&door), "{text}");
     }
 
     #[test]

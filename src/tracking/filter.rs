@@ -104,7 +104,14 @@ pub struct Filter {
     pub(super) distrusted: Vec<bool>,
     /// Least and greatest position of each joint so far.
     pub(super) explored: Vec<[f64; 2]>,
+    /// Rate of each joint when clouds or the tool last corrected it: what nothing drives goes no faster.
+    corrected_rates: Vec<f64>,
     cursor: usize,
+}
+
+/// Standard deviation of the unexplained force on a joint \[N or N·m\].
+fn disturbance_deviation(mechanism: &TrackedMechanism, tree: &Tree<f64>, joint: usize) -> f64 {
+    (DISTURBANCE * tree.bodies()[joint].parameters.friction).hypot(mechanism.unexplained[joint])
 }
 
 impl Filter {
@@ -127,7 +134,7 @@ impl Filter {
             covariance[(n + joint, n + joint)] =
                 if rates[joint] == 0.0 { 0.0 } else { (rate_deviation / reach).powi(2) };
             covariance[(2 * n + 3 + joint, 2 * n + 3 + joint)] =
-                (DISTURBANCE * mechanism.tree.bodies()[joint].parameters.friction).powi(2);
+                disturbance_deviation(&mechanism, &mechanism.tree, joint).powi(2);
         }
         let start_of_numbers = 3 * n + 3;
         covariance.view_mut((start_of_numbers, start_of_numbers), (count, count)).copy_from(&mechanism.covariance);
@@ -135,9 +142,11 @@ impl Filter {
             covariance[(i, i)] += NUMBER_DEVIATION.0.powi(2);
         }
         let workspace = Workspace::new(&mechanism.tree);
+        let corrected_rates = rates.iter().map(|rate| rate.abs()).collect();
         let state = State::new(positions, rates);
         Self {
             explored: mechanism.explored.clone(),
+            corrected_rates,
             distrusted: vec![false; n],
             disturbance: vec![0.0; n],
             numbers: mechanism.numbers.clone(),
@@ -209,6 +218,16 @@ impl Filter {
             .collect()
     }
 
+    /// The rate of a body's joint at which its centre of mass would go at a velocity in world \[m/s\], as far
+    /// as it can.
+    pub fn rate_of(&self, body: usize, velocity: &Vector3<f64>) -> f64 {
+        let tree = &self.mechanism.tree;
+        let center = tree.displacements(&self.state.positions)[body].transform_point(&self.mechanism.centers[body]);
+        let Spatial { angular, linear } = tree.screws(&self.state.positions)[body];
+        let slope = angular.cross(&center) + linear;
+        slope.dot(velocity) / slope.norm_squared().max(1e-6)
+    }
+
     /// Positions of a body's joint all through where it was seen and somewhat beyond, with the body's
     /// displacement there.
     pub fn places_along(&self, body: usize) -> Vec<(f64, Pose)> {
@@ -225,20 +244,23 @@ impl Filter {
             .collect()
     }
 
-    /// Puts a body's joint at a position where it was found, at rest; what holds it must take hold anew.
-    pub fn place(&mut self, body: usize, position: f64) {
+    /// Puts a body's joint at a position where it was found, with the rate that it was found to have; what
+    /// holds it must take hold anew.
+    pub fn place(&mut self, body: usize, position: f64, rate: f64) {
         let n = self.mechanism.joints.len();
         if self.held.is_some_and(|held| self.mechanism.chain(held.body).contains(&body)) {
             self.release();
         }
         self.state.positions[body] = position;
-        self.state.rates[body] = 0.0;
+        self.state.rates[body] = rate;
+        self.corrected_rates[body] = rate.abs();
         self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
         for at in [body, n + body] {
             self.covariance.row_mut(at).fill(0.0);
             self.covariance.column_mut(at).fill(0.0);
         }
         self.covariance[(body, body)] = (SEARCH_STEP / self.mechanism.reach(body)).powi(2);
+        self.covariance[(n + body, n + body)] = (0.5 * rate).powi(2);
     }
 
     /// What moves a body is not as the mechanism says: it stops, and is not forecast.
@@ -330,8 +352,9 @@ impl Filter {
             self.fade(span);
             return;
         }
-        let first = samples.partition_point(|s| s.stamp_s < self.time_s - 0.05);
-        let last = samples.partition_point(|s| s.stamp_s <= to_s + 0.02);
+        let delay_s = self.mechanism.sensor.delay_s;
+        let first = samples.partition_point(|s| s.stamp_s < self.time_s - 0.05 + delay_s.min(0.0));
+        let last = samples.partition_point(|s| s.stamp_s <= to_s + 0.02 + delay_s.max(0.0));
         let samples = &samples[first..last.max(first)];
         self.cursor = 0;
         let pieces = ((to_s - self.time_s) / LINEAR - 1e-6).ceil().max(1.0) as usize;
@@ -347,7 +370,8 @@ impl Filter {
         let span = [self.time_s, to_s];
         let joints = self.moving_joints();
         let resting = self.resting();
-        let drive = Drive { held: self.held, samples, resting: &resting, step_s: STEP };
+        let sensor = self.mechanism.sensor;
+        let drive = Drive { held: self.held, samples, sensor, resting: &resting, step_s: STEP };
         let coordinates = self.coordinates_of(&joints);
         // (q, q̇) of the moving joints by each of their coordinates.
         let mut slopes = DMatrix::zeros(2 * joints.len(), coordinates.len());
@@ -491,8 +515,8 @@ impl Filter {
             self.disturbance[joint] *= faded;
             self.covariance.row_mut(at).scale_mut(faded);
             self.covariance.column_mut(at).scale_mut(faded);
-            let friction = self.tree.bodies()[joint].parameters.friction;
-            let stationary = (DISTURBANCE * friction).powi(2) * self.unease.min(MOST_DISTURBED);
+            let stationary =
+                disturbance_deviation(&self.mechanism, &self.tree, joint).powi(2) * self.unease.min(MOST_DISTURBED);
             self.covariance[(at, at)] += stationary * (1.0 - faded * faded);
         }
     }
@@ -618,13 +642,17 @@ impl Filter {
         let inverse = DMatrix::from_column_slice(6, 6, inverse.as_slice());
         let before = self.state.rates.clone();
         self.correct(&jacobian, &inverse, &DVector::from_column_slice(innovation.as_slice()));
-        // What nothing drives does not speed up because a scan was matched elsewhere.
+        // What nothing drives does not speed up because a scan was matched elsewhere; but it may coast
+        // further than the model's friction lets it.
         let driven = self.held.map(|held| self.mechanism.chain(held.body)).unwrap_or_default();
         for joint in (0..n).filter(|joint| !driven.contains(joint)) {
-            let most = before[joint].abs();
+            let most = self.corrected_rates[joint].max(before[joint].abs());
             self.state.rates[joint] = self.state.rates[joint].clamp(-most, most);
         }
         self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
+        for joint in 0..n {
+            self.corrected_rates[joint] = self.state.rates[joint].abs();
+        }
     }
 
     /// x ← x + K z, K = P Hᵀ S⁻¹; where the numbers are only considered their rows of K are zero
@@ -644,9 +672,9 @@ impl Filter {
         for joint in 0..n {
             self.state.positions[joint] += change[joint];
             self.state.rates[joint] += change[n + joint];
-            let friction = self.tree.bodies()[joint].parameters.friction;
+            let most = self.tree.bodies()[joint].parameters.friction + 3.0 * self.mechanism.unexplained[joint];
             let disturbance = self.disturbance[joint] + change[2 * n + 3 + joint];
-            self.disturbance[joint] = disturbance.clamp(-friction, friction);
+            self.disturbance[joint] = disturbance.clamp(-most, most);
         }
         self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
         if let Some(held) = &mut self.held {

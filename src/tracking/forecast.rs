@@ -27,49 +27,20 @@ const FOUND_CLOSED: f64 = 0.5;
 /// Nothing predicted is faster than this, nor speeds up by more \[m/s\].
 const FASTEST: f64 = 1.5;
 
-/// One part at one horizon.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// All bodies at one horizon.
+#[derive(Clone, Debug, PartialEq)]
 pub struct Forecast {
-    /// The part.
-    pub label: Label,
-    /// Index of the horizon.
-    pub horizon: usize,
-    /// D.
-    pub displacement: Pose,
-    /// c, its centre of mass at the reference configuration \[m\].
-    pub center: Vector3<f64>,
-    /// Covariance of D·c \[m²\].
-    pub covariance_m2: Matrix3<f64>,
-}
-
-/// The mixture of two predictions of a part with its centre at `center`, the first with probability
-/// `weight`, as one Gaussian of the same mean and covariance; between two turns along the screw.
-pub fn mix(
-    first: (Pose, Matrix3<f64>),
-    second: (Pose, Matrix3<f64>),
-    weight: f64,
-    center: &Vector3<f64>,
-) -> (Pose, Matrix3<f64>) {
-    if weight > 0.9999 {
-        return first;
-    }
-    if weight < 0.0001 {
-        return second;
-    }
-    let to_center = Pose::from_translation(*center);
-    let between = ((first.0 * to_center).inverse() * second.0 * to_center).log();
-    let displacement = first.0 * to_center * Pose::exp(&(between * (1.0 - weight))) * Pose::from_translation(-center);
-    let apart = first.0.transform_point(center) - second.0.transform_point(center);
-    let covariance =
-        first.1 * weight + second.1 * (1.0 - weight) + apart * apart.transpose() * (weight * (1.0 - weight));
-    (displacement, covariance)
+    /// q, by joint \[m or rad\].
+    pub positions: Vec<f64>,
+    /// Covariance of each body's centre of mass, D·c \[m²\].
+    pub covariances_m2: Vec<Matrix3<f64>>,
 }
 
 /// Joint positions by time, the first at the filter's own.
 type Path = Vec<Vec<f64>>;
 
 impl Filter {
-    /// Every jointed part at `horizons_s` after the filter's time, ascending, under the wrenches read.
+    /// Every body at `horizons_s` after the filter's time, ascending, under the wrenches read.
     pub fn forecast(&self, horizons_s: &[f64], samples: &[WrenchSample]) -> Vec<Forecast> {
         let n = self.mechanism.joints.len();
         let times_s: Vec<f64> =
@@ -84,29 +55,16 @@ impl Filter {
             path = self.simulate(&[], &times_s, samples, STEP).unwrap_or_else(stay);
             errors = self.spread(&path, &times_s, samples);
         }
-        let tree = &self.mechanism.tree;
-        let mut forecasts = Vec::with_capacity(n * horizons_s.len());
-        for horizon in 0..horizons_s.len() {
-            let (positions, variances) = self.before_unknown_stops(&path[horizon + 1]);
+        let forecast = |(positions, mut errors): (&Vec<f64>, DMatrix<f64>)| {
+            let (positions, variances) = self.before_unknown_stops(positions);
             for (joint, variance) in variances.iter().enumerate() {
-                errors[horizon + 1][(joint, joint)] += variance;
+                errors[(joint, joint)] += variance;
             }
-            let displacements = tree.displacements(&positions);
-            for (body, joint) in self.mechanism.joints.iter().enumerate() {
-                if self.mechanism.chain(body).iter().any(|&joint| self.distrusted[joint]) {
-                    continue;
-                }
-                let covariance_m2 = center_covariance(&self.mechanism, body, &positions, &errors[horizon + 1]);
-                forecasts.push(Forecast {
-                    label: joint.child,
-                    horizon,
-                    displacement: displacements[body],
-                    center: self.mechanism.centers[body],
-                    covariance_m2,
-                });
-            }
-        }
-        forecasts
+            let spread = |body| center_covariance(&self.mechanism, body, &positions, &errors);
+            let covariances_m2 = (0..n).map(spread).collect();
+            Forecast { positions, covariances_m2 }
+        };
+        path.iter().zip(errors).skip(1).map(forecast).collect()
     }
 
     /// Where each part is expected at a later time under the wrenches read.
@@ -118,21 +76,15 @@ impl Filter {
         self.placed(&self.before_unknown_stops(&positions).0)
     }
 
-    /// Each part after each horizon if its joints keep their rates, fading, and if they stop.
-    pub fn steady(&self, horizons_s: &[f64]) -> BTreeMap<Label, Vec<[Pose; 2]>> {
-        let stopped = self.placed(&self.state.positions);
-        let mut steady: BTreeMap<Label, Vec<[Pose; 2]>> = BTreeMap::new();
-        for horizon_s in horizons_s {
-            let lasting = FADE * (1.0 - (-horizon_s / FADE).exp());
-            let moved = self.state.positions.iter().zip(&self.state.rates).map(|(q, rate)| q + rate * lasting);
-            for (label, pose) in self.placed(&moved.collect::<Vec<_>>()) {
-                steady.entry(label).or_default().push([pose, stopped[&label]]);
-            }
-        }
-        steady
+    /// Joint positions after a horizon if the joints keep their rates, fading, and if they stop.
+    pub fn steady(&self, horizon_s: f64) -> [Vec<f64>; 2] {
+        let lasting = FADE * (1.0 - (-horizon_s / FADE).exp());
+        let moved = self.state.positions.iter().zip(&self.state.rates).map(|(q, rate)| q + rate * lasting);
+        [moved.collect(), self.state.positions.clone()]
     }
 
-    fn placed(&self, positions: &[f64]) -> BTreeMap<Label, Pose> {
+    /// Displacements of all jointed parts at joint positions.
+    pub fn placed(&self, positions: &[f64]) -> BTreeMap<Label, Pose> {
         let displacements = self.mechanism.tree.displacements(positions);
         self.mechanism.joints.iter().map(|joint| joint.child).zip(displacements).collect()
     }
@@ -147,7 +99,7 @@ impl Filter {
     ) -> Option<Path> {
         let Start { mut tree, mut state, mut disturbance, held } = self.start(changes)?;
         let resting = self.resting();
-        let drive = Drive { held, samples, resting: &resting, step_s };
+        let drive = Drive { held, samples, sensor: self.mechanism.sensor, resting: &resting, step_s };
         let mut workspace = Workspace::new(&tree);
         let mut cursor = 0;
         let first = self.state.positions.clone();

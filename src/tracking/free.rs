@@ -88,6 +88,13 @@ impl FreePart {
         (self.center != Vector3::zeros()).then_some(self.center)
     }
 
+    /// Velocity of a point of it that is at `place` now \[m/s\].
+    pub fn velocity_at(&self, place: &Vector3<f64>) -> Vector3<f64> {
+        let turn = self.displacement.rotation * self.twist.fixed_rows::<3>(0);
+        let arm = place - self.displacement.transform_point(&self.center);
+        self.displacement.rotation * self.twist.fixed_rows::<3>(3) + turn.cross(&arm)
+    }
+
     /// Its displacement after a horizon \[s\], and the covariance of its points \[m²\].
     pub fn after(&self, horizon_s: f64) -> (Pose, Matrix3<f64>) {
         let speed = self.twist.fixed_rows::<3>(3).norm();

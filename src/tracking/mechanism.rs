@@ -9,7 +9,7 @@ use nalgebra::{DMatrix, DVector, Vector3};
 use crate::math::skew;
 use crate::mechanism::effects::{AttachedEffect, EffectKind};
 use crate::mechanism::{JointType, Tree};
-use crate::model::{DynamicsLearner, KinematicFit, KinematicJoint};
+use crate::model::{DynamicsLearner, KinematicFit, KinematicJoint, SensorError};
 use crate::types::Label;
 
 /// A number of the dynamics that the filter may move.
@@ -81,6 +81,10 @@ pub struct TrackedMechanism {
     pub tool_offset: Vector3<f64>,
     /// Process noise in units of what the wrench sensor explains.
     pub noise_scale: f64,
+    /// What is wrong with the reported wrench.
+    pub sensor: SensorError<f64>,
+    /// By joint, how large a force may be that was seen and has no name \[N or N·m\].
+    pub unexplained: Vec<f64>,
 }
 
 impl TrackedMechanism {
@@ -118,6 +122,8 @@ impl TrackedMechanism {
         Some(Self {
             joints: fit.joints.clone(),
             trees,
+            sensor: dynamics.sensor_error(&posterior.mean),
+            unexplained: dynamics.unexplained_forces(&posterior.mean),
             numbers: posterior.mean,
             active,
             covariance,
@@ -128,21 +134,6 @@ impl TrackedMechanism {
             tool_offset: fit.tool_offset,
             noise_scale: noise_scale.max(1.0),
         })
-    }
-
-    /// The same with no more than the declared physics; `None` if that makes no tree.
-    pub fn without_effects(&self) -> Option<Self> {
-        let whole = self.trees.clone();
-        let trees = TreeFamily::new(move |numbers| {
-            let mut tree = (whole.0)(numbers)?;
-            (0..tree.body_count()).for_each(|body| {
-                let parameters = tree.parameters_mut(body);
-                parameters.effects.clear();
-                parameters.tables.clear();
-            });
-            Some(tree)
-        });
-        Some(Self { tree: trees.tree(&self.numbers)?, trees, ..self.clone() })
     }
 
     /// The body of a part.

@@ -9,9 +9,9 @@ mod filter;
 mod forecast;
 mod free;
 mod mechanism;
+mod mixture;
 mod plan;
 mod presence;
-mod score;
 mod simulation;
 mod skill;
 #[cfg(test)]
@@ -19,10 +19,10 @@ mod tests;
 
 pub use calibration::{Calibration, Kind};
 pub use filter::{Filter, Held};
-pub use forecast::{Forecast, mix};
+pub use forecast::Forecast;
 pub use free::FreePart;
 pub use mechanism::{ActiveNumber, TrackedMechanism, TreeFamily};
+pub use mixture::{FreeAccount, JointAccount, Mixed, mixture};
 pub use plan::{Plan, PlannedPose};
 pub use presence::{Account, Presence};
-pub use score::{MeasuredPath, ResidualSum};
 pub use skill::Skill;

@@ -4,6 +4,8 @@
 //! normal: positions, rates, unexplained forces and the dynamics' numbers of the joints that move. Each is
 //! simulated on under the plan; the spread is about the mean's own path.
 
+use std::sync::Arc;
+
 use nalgebra::{DMatrix, Matrix3, Vector3};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -12,6 +14,7 @@ use rand_distr::{Distribution, StandardNormal};
 use super::filter::{Filter, Held};
 use crate::math::Pose;
 use crate::mechanism::WrenchSample;
+use crate::model::SensorError;
 use crate::types::Label;
 
 /// Longest step of a sample's simulation \[s\].
@@ -59,6 +62,8 @@ impl Filter {
         let displacements = filter.mechanism.tree.displacements(&filter.state.positions);
         let point = displacements[body].inverse().transform_point(&plan.point_in_world);
         filter.held = Some(Held { body, point });
+        // The planned wrench is what acts, not what is reported.
+        Arc::make_mut(&mut filter.mechanism).sensor = SensorError::none();
         let times_s: Vec<f64> =
             std::iter::once(0.0).chain(plan.times_s.iter().copied()).map(|t| filter.time_s + t).collect();
         let samples = held_readings(&plan.profile, filter.time_s);

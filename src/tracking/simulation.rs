@@ -3,6 +3,7 @@
 use super::filter::Held;
 use super::mechanism::set_disturbance;
 use crate::mechanism::{State, Step, Tree, Workspace, WrenchPoint, WrenchSample, WrenchTrack, step};
+use crate::model::SensorError;
 
 /// An unexplained force is forgotten within this \[s\]: e^(−t/T).
 pub(super) const DISTURBANCE_MEMORY: f64 = 0.4;
@@ -15,6 +16,8 @@ pub(super) struct Drive<'a> {
     pub held: Option<Held>,
     /// Readings of the wrench.
     pub samples: &'a [WrenchSample],
+    /// What is wrong with them.
+    pub sensor: SensorError<f64>,
     /// Joints that stay, with their positions.
     pub resting: &'a [(usize, f64)],
     /// Longest step \[s\].
@@ -34,6 +37,9 @@ impl Drive<'_> {
     ) {
         let track = self.held.map(|held| WrenchTrack {
             point: WrenchPoint::Carried(held.point),
+            delay_s: self.sensor.delay_s,
+            force_bias: self.sensor.force_bias,
+            torque_bias: self.sensor.torque_bias,
             ..WrenchTrack::new(held.body, self.samples)
         });
         let length = span[1] - span[0];

@@ -46,6 +46,8 @@ pub(super) fn drawer(damping: f64) -> TrackedMechanism {
         centers: vec![Vector3::zeros()],
         tool_offset: Vector3::new(0.002, -0.001, 0.0),
         noise_scale: 1.0,
+        sensor: crate::model::SensorError::none(),
+        unexplained: vec![0.0],
     }
 }
 
@@ -95,12 +97,12 @@ fn a_simulated_track_is_recovered_and_predicted() {
     let (filter, ahead) = filtered(drawer(8.0));
     assert!((filter.positions()[0] - ahead[1].0).abs() < 5e-4, "{filter:?} {ahead:?}");
     assert!((filter.rates()[0] - ahead[1].1).abs() < 5e-3);
-    for forecast in filter.forecast(&[0.1, 0.5], &readings()) {
-        let error = forecast.displacement.translation.x - ahead[2 + forecast.horizon].0;
-        assert!(error.abs() < 1e-3, "{error} m at horizon {}", forecast.horizon);
-        assert!(error.abs() < 2.0 * forecast.covariance_m2[(0, 0)].sqrt());
-        assert_eq!(forecast.label, Label(4));
+    for (horizon, forecast) in filter.forecast(&[0.1, 0.5], &readings()).iter().enumerate() {
+        let error = forecast.positions[0] - ahead[2 + horizon].0;
+        assert!(error.abs() < 1e-3, "{error} m at horizon {horizon}");
+        assert!(error.abs() < 2.0 * forecast.covariances_m2[0][(0, 0)].sqrt());
     }
+    assert_eq!(filter.placed(&[0.2])[&Label(4)], Pose::from_translation(Vector3::x() * 0.2));
 }
 
 #[test]
@@ -116,8 +118,8 @@ fn what_rests_stays_exactly() {
     filter.advance(10.0, &readings());
     assert!(filter.rests() && filter.positions() == [0.12]);
     for forecast in filter.forecast(&[0.1, 0.5, 1.0], &readings()) {
-        assert_eq!(forecast.displacement, Pose::from_translation(Vector3::x() * 0.12));
-        assert!(forecast.covariance_m2[(0, 0)].sqrt() < 0.002);
+        assert_eq!(forecast.positions, [0.12]);
+        assert!(forecast.covariances_m2[0][(0, 0)].sqrt() < 0.002);
     }
     // Held by less than friction: it sticks.
     let weak: Vec<WrenchSample> =
@@ -141,10 +143,10 @@ fn a_wrong_number_is_found_while_the_tool_pulls() {
     let (filter, ahead) = filtered(wrong);
     let damping = filter.numbers()[0].exp();
     assert!((damping / 8.0).ln().abs() < (20.0f64 / 8.0).ln() * 0.5, "{damping} N·s/m");
-    for forecast in filter.forecast(&[0.1, 0.5], &readings()) {
-        let error = forecast.displacement.translation.x - ahead[2 + forecast.horizon].0;
-        let std = forecast.covariance_m2[(0, 0)].sqrt();
-        assert!(error.abs() < 2.5 * std, "{error} m, stated {std} m, at horizon {}", forecast.horizon);
+    for (horizon, forecast) in filter.forecast(&[0.1, 0.5], &readings()).iter().enumerate() {
+        let error = forecast.positions[0] - ahead[2 + horizon].0;
+        let std = forecast.covariances_m2[0][(0, 0)].sqrt();
+        assert!(error.abs() < 2.5 * std, "{error} m, stated {std} m, at horizon {horizon}");
     }
 }
 
@@ -177,10 +179,10 @@ fn a_stop_may_wait_beyond_what_was_seen() {
         filter.hold_point(0, CONTACT, 0.001);
         let strong: Vec<WrenchSample> =
             readings().iter().map(|s| WrenchSample { force_in_world: Vector3::x() * 7.0, ..*s }).collect();
-        filter.forecast(&[0.5], &strong)[0]
+        filter.forecast(&[0.5], &strong).remove(0)
     };
     let (known, unknown) = (far(drawer(8.0)), far(unexplored));
-    let way = |forecast: &super::Forecast| forecast.displacement.translation.x - 0.05;
+    let way = |forecast: &super::Forecast| forecast.positions[0] - 0.05;
     assert!(way(&unknown) < 0.9 * way(&known) && way(&unknown) > 0.5 * way(&known));
-    assert!(unknown.covariance_m2[(0, 0)] > 2.0 * known.covariance_m2[(0, 0)]);
+    assert!(unknown.covariances_m2[0][(0, 0)] > 2.0 * known.covariances_m2[0][(0, 0)]);
 }

@@ -32,3 +32,14 @@ pub fn bom<A: AsRef<OsStr>>(arguments: &[A]) -> Outcome {
 pub fn ours(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
 }
+
+/// A file of the public records, or nothing and a line that says so.
+#[allow(clippy::print_stderr, reason = "says why a test does nothing")]
+pub fn measured(name: &str) -> Option<PathBuf> {
+    let path = ours("../shared/measured").join(name);
+    if !path.exists() {
+        eprintln!("SKIPPED: {} is not there", path.display());
+        return None;
+    }
+    Some(path)
+}

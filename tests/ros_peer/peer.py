@@ -242,7 +242,9 @@ def live(bag, settle="60", model="/tmp/model.json"):
     late = Peer("late")
     late.hear(f"{NODE}/object_posterior", ObjectPosterior, quality(latched=True, depth=1))
     late.hear(f"{NODE}/robot_description", String, quality(latched=True, depth=1))
-    late.wait(lambda: late.last("object_posterior") and late.last("robot_description"), 10.0)
+    # Of a writer's history the newest may come last.
+    newest = lambda: late.last("object_posterior") and late.last("object_posterior").windows_learned == windows()
+    late.wait(lambda: newest() and late.last("robot_description"), 10.0)
     posterior = node.last("object_posterior")
     predicted = node.last("predicted_poses")
     # What removes all before has no namespace, and whoever joins later does not hear it.
@@ -299,6 +301,41 @@ def live(bag, settle="60", model="/tmp/model.json"):
         },
         "nodes": [f"{space.rstrip('/')}/{name}" for name, space in node.get_node_names_and_namespaces()],
         "log": [m.msg for _, m in node.heard["/rosout"]],
+    }
+
+
+def play(bag, settle="180"):
+    """A whole bag: what was learned of it, to the last digit."""
+    node = Peer()
+    ready(node)
+    node.hear("/tf", TFMessage, quality(depth=100))
+    player = Player(node, bag)
+    node.wait(lambda: node.count_subscribers("/parts/points") > 0, 10.0)
+    node.spin(1.0)
+    player.play()
+
+    def learned():
+        report = status(node.last("diagnostics")).get("bom: inference", {}).get("values", {})
+        idle = report.get("windows waiting") == "0" and report.get("inference running for [s]") == "0.00"
+        return idle and node.last("object_posterior").windows_learned == int(report.get("windows learned", -1))
+
+    node.spin(3.0)
+    settled = node.wait(learned, float(settle))
+    node.spin(0.5)
+    posterior = node.last("object_posterior")
+    states = [m for _, m in node.heard[f"{NODE}/joint_states"] if len(m.velocity) == len(m.name) > 0]
+    return {
+        "settled": settled,
+        "windows": posterior.windows_learned,
+        "joints": joints(posterior),
+        "medians": {
+            e.child: [e.damping.median, e.friction.median, e.joint_inertia.median]
+            for e in posterior.edges
+            if e.probability > 0.5
+        },
+        "predicted": node.count("predicted_poses"),
+        "fastest": max((abs(v) for m in states for v in m.velocity), default=0.0),
+        "tf": sorted({t.child_frame_id for _, m in node.heard["/tf"] for t in m.transforms if "part" in t.child_frame_id}),
     }
 
 

@@ -9,7 +9,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 /// Why a bag cannot be opened.
@@ -167,4 +167,111 @@ fn from_listing(folder: &Path) -> Result<BagFiles, BagError> {
     // bag_2 before bag_10.
     paths.sort_by_key(|path| (path.as_os_str().len(), path.clone()));
     Ok(BagFiles { paths, messages_are_compressed: false })
+}
+
+/// A topic of a file, and how many messages it has there.
+pub(super) struct TopicCount {
+    pub name: String,
+    pub type_name: String,
+    pub count: u64,
+}
+
+/// What a folder says of its only file.
+pub(super) struct FileSummary {
+    pub file: String,
+    /// Earliest and latest log time \[ns\].
+    pub span_ns: (u64, u64),
+    pub topics: Vec<TopicCount>,
+}
+
+#[derive(Serialize)]
+struct Nanoseconds {
+    nanoseconds: u64,
+}
+
+#[derive(Serialize)]
+struct SinceEpoch {
+    nanoseconds_since_epoch: u64,
+}
+
+#[derive(Serialize)]
+struct TopicMetadata<'a> {
+    name: &'a str,
+    r#type: &'a str,
+    serialization_format: &'static str,
+    offered_qos_profiles: [(); 0],
+    type_description_hash: &'static str,
+}
+
+#[derive(Serialize)]
+struct TopicEntry<'a> {
+    topic_metadata: TopicMetadata<'a>,
+    message_count: u64,
+}
+
+#[derive(Serialize)]
+struct FileEntry<'a> {
+    path: &'a str,
+    starting_time: SinceEpoch,
+    duration: Nanoseconds,
+    message_count: u64,
+}
+
+#[derive(Serialize)]
+struct FolderMetadata<'a> {
+    version: u32,
+    storage_identifier: &'static str,
+    duration: Nanoseconds,
+    starting_time: SinceEpoch,
+    message_count: u64,
+    topics_with_message_count: Vec<TopicEntry<'a>>,
+    compression_format: &'static str,
+    compression_mode: &'static str,
+    relative_file_paths: [&'a str; 1],
+    files: [FileEntry<'a>; 1],
+    custom_data: Option<()>,
+    ros_distro: &'static str,
+}
+
+#[derive(Serialize)]
+struct FolderFile<'a> {
+    rosbag2_bagfile_information: FolderMetadata<'a>,
+}
+
+impl<'a> From<&'a TopicCount> for TopicEntry<'a> {
+    fn from(topic: &'a TopicCount) -> Self {
+        let topic_metadata = TopicMetadata {
+            name: &topic.name,
+            r#type: &topic.type_name,
+            serialization_format: "cdr",
+            offered_qos_profiles: [],
+            type_description_hash: "",
+        };
+        Self { topic_metadata, message_count: topic.count }
+    }
+}
+
+/// Writes a folder's metadata.yaml.
+pub(super) fn write_metadata(path: &Path, summary: &FileSummary) -> io::Result<()> {
+    let (first, last) = summary.span_ns;
+    let duration = || Nanoseconds { nanoseconds: last - first };
+    let starting_time = || SinceEpoch { nanoseconds_since_epoch: first };
+    let message_count = summary.topics.iter().map(|topic| topic.count).sum();
+    let file = FileEntry { path: &summary.file, starting_time: starting_time(), duration: duration(), message_count };
+    let metadata = FolderMetadata {
+        version: 9,
+        storage_identifier: "mcap",
+        duration: duration(),
+        starting_time: starting_time(),
+        message_count,
+        topics_with_message_count: summary.topics.iter().map(TopicEntry::from).collect(),
+        compression_format: "",
+        compression_mode: "",
+        relative_file_paths: [&summary.file],
+        files: [file],
+        custom_data: None,
+        ros_distro: "jazzy",
+    };
+    let text = serde_yaml_ng::to_string(&FolderFile { rosbag2_bagfile_information: metadata });
+    fs::write(path, text.map_err(io::Error::other)?)
 }

@@ -4,6 +4,7 @@
 //! in time. Damage ends nothing: what is readable is delivered, the rest is reported by place.
 
 mod folder;
+mod recorder;
 mod records;
 mod walk;
 mod writer;
@@ -21,6 +22,7 @@ use std::{
 use tracing::warn;
 
 pub use folder::BagError;
+pub use recorder::{FolderRecorder, RecordError, Recorder};
 pub use records::DamageKind;
 pub use writer::{BagWriter, Compression, TopicId, WriteError};
 

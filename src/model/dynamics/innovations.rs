@@ -11,6 +11,7 @@
 
 use nalgebra::{DMatrix, DVector, Vector3};
 use num_dual::DualSVec64;
+use rayon::prelude::*;
 
 use super::layout::{Mechanism, SensorError};
 use super::track::{CONTACT_DEVIATION, Drive, JointTrack, Observation};
@@ -72,6 +73,25 @@ pub(super) struct FilterStep {
     pub(super) transition: DMatrix<f64>,
 }
 
+/// The way from one observation to the next.
+struct Advance {
+    span: [f64; 2],
+    /// (q, q̇) at its start and at its end.
+    before: DVector<f64>,
+    after: DVector<f64>,
+    /// Of the whole state.
+    transition: DMatrix<f64>,
+    /// Of (q, q̇) by the parameters, as far as they are taken with the simulation, and by (q, q̇) before.
+    derivatives: DMatrix<f64>,
+}
+
+/// One observation, and the way to it.
+struct Passed {
+    advance: Option<Advance>,
+    rows: DMatrix<f64>,
+    gain: Gain,
+}
+
 /// Innovations of a window.
 #[derive(Clone, Debug, Default)]
 pub struct Innovations {
@@ -99,6 +119,7 @@ const CHUNK: usize = 8;
 const DIFFERENCE: f64 = 1e-6;
 
 /// What a simulation needs of the parameters.
+#[derive(Clone)]
 pub(super) struct Plant<T: Real> {
     pub(super) tree: Tree<T>,
     sensor: SensorError<T>,
@@ -122,7 +143,7 @@ impl WindowModel<'_> {
     pub fn linearize(&self, x: &[f64], active: &[usize]) -> Result<Innovations, Failure> {
         let n = self.moving.len();
         let p = active.len();
-        let slopes_by = if n > 1 { self.differences(x, active)? } else { self.forward(x, active)? };
+        let slopes = if n > 1 { self.differences(x, active)? } else { self.forward(x, active)? };
         let noise = ProcessNoise::new(self, x)?;
         let observations = &self.track.observations;
         if observations.len() < 3 {
@@ -130,27 +151,26 @@ impl WindowModel<'_> {
         }
         let mut state = self.first_state();
         let size = 2 * n + CONTACT;
-        let mut slopes = DMatrix::zeros(size, p);
         let mut covariance = self.first_covariance(&state);
         let mut result = Innovations::default();
+        let mut passed: Vec<Passed> = Vec::with_capacity(observations.len());
         for (k, observation) in observations.iter().enumerate() {
+            let mut advance = None;
             if k > 0 {
                 let span = [observations[k - 1].time_s, observation.time_s];
-                let moved = state.rows(0, 2 * n).into_owned();
-                let (next, derivatives) = self.advance_with_slopes(&slopes_by, &moved, span, p)?;
+                let before = state.rows(0, 2 * n).into_owned();
+                let (next, derivatives) = self.advance_with_slopes(&slopes, &before, span, p)?;
                 state.rows_mut(0, 2 * n).copy_from(&next);
+                let at = derivatives.ncols() - 2 * n;
                 let mut transition = DMatrix::identity(size, size);
-                transition.view_mut((0, 0), (2 * n, 2 * n)).copy_from(&derivatives.columns(p, 2 * n));
-                slopes = &transition * slopes;
-                let mut own = slopes.rows_mut(0, 2 * n);
-                own += derivatives.columns(0, p);
+                transition.view_mut((0, 0), (2 * n, 2 * n)).copy_from(&derivatives.columns(at, 2 * n));
                 covariance = &transition * covariance * transition.transpose();
                 let mut own = covariance.view_mut((0, 0), (2 * n, 2 * n));
                 own += noise.over(span, &self.all_positions(state.as_slice()), self)?;
+                advance = Some(Advance { span, before, after: next, transition, derivatives });
             }
             let rows = state_rows(observation);
             let innovation = &observation.value - &rows * &state;
-            let innovation_slopes = -(&rows * &slopes);
             let spread = &covariance * rows.transpose();
             let total = &rows * &spread + DMatrix::identity(n, n);
             let cholesky = total.cholesky().ok_or(Failure::Diverged)?;
@@ -159,21 +179,55 @@ impl WindowModel<'_> {
             covariance = (&covariance + covariance.transpose()) * 0.5;
             let deviation = cholesky.unpack();
             let whitened = deviation.solve_lower_triangular(&innovation).ok_or(Failure::Diverged)?;
-            let whitened_slopes = deviation.solve_lower_triangular(&innovation_slopes).ok_or(Failure::Diverged)?;
             result.half_log_determinant += deviation.diagonal().iter().map(|d| d.ln()).sum::<f64>();
             result.whitened.extend(whitened.iter());
-            for row in 0..n {
-                result.slopes.extend(whitened_slopes.row(row).iter());
-            }
             state += &gain * innovation;
-            slopes += &gain * innovation_slopes;
-            result.gains.push(Gain { gain, deviation });
+            passed.push(Passed { advance, rows, gain: Gain { gain, deviation } });
         }
+        let column = |i: usize| {
+            self.innovation_slopes(&passed, |advance| match &slopes {
+                Slopes::Forward(_) => Ok(advance.derivatives.column(i).into_owned()),
+                Slopes::Differences(_, moved) => {
+                    let end = self.advance(&moved[i], advance.before.as_slice(), advance.span)?;
+                    Ok((DVector::from_vec(end) - &advance.after) / DIFFERENCE)
+                }
+            })
+        };
+        let columns: Vec<Vec<f64>> = match slopes {
+            Slopes::Forward(_) => (0..p).map(column).collect::<Result<_, _>>()?,
+            // In the order of `active`, so threads do not show in the result.
+            Slopes::Differences(..) => (0..p).into_par_iter().map(column).collect::<Result<_, _>>()?,
+        };
+        result.slopes = (0..result.whitened.len()).flat_map(|row| columns.iter().map(move |c| c[row])).collect();
+        result.gains = passed.into_iter().map(|passed| passed.gain).collect();
         if result.whitened.iter().chain(&result.slopes).all(|e| e.is_finite()) {
             Ok(result)
         } else {
             Err(Failure::Diverged)
         }
+    }
+
+    /// Derivatives of the whitened innovations by one parameter, with `driven` its derivative of a span's
+    /// end for a fixed start.
+    fn innovation_slopes(
+        &self,
+        passed: &[Passed],
+        driven: impl Fn(&Advance) -> Result<DVector<f64>, Failure>,
+    ) -> Result<Vec<f64>, Failure> {
+        let n = self.moving.len();
+        let mut slope = DVector::zeros(2 * n + CONTACT);
+        let mut all = Vec::with_capacity(n * passed.len());
+        for Passed { advance, rows, gain: Gain { gain, deviation } } in passed {
+            if let Some(advance) = advance {
+                slope = &advance.transition * slope;
+                let mut own = slope.rows_mut(0, 2 * n);
+                own += driven(advance)?;
+            }
+            let innovation = -(rows * &slope);
+            slope += gain * &innovation;
+            all.extend(deviation.solve_lower_triangular(&innovation).ok_or(Failure::Diverged)?.iter());
+        }
+        Ok(all)
     }
 
     /// The filter alone, step by step.
@@ -278,7 +332,8 @@ impl WindowModel<'_> {
         Ok(Slopes::Differences(self.plant(x)?, moved))
     }
 
-    /// The state after a span, and its derivatives by parameters and by the state before.
+    /// The state after a span, and its derivatives: by parameters where they come with the simulation, then
+    /// by the state before.
     fn advance_with_slopes(
         &self,
         slopes: &Slopes,
@@ -288,21 +343,14 @@ impl WindowModel<'_> {
     ) -> Result<(DVector<f64>, DMatrix<f64>), Failure> {
         let chunks = match slopes {
             Slopes::Forward(chunks) => chunks,
-            Slopes::Differences(plant, moved) => {
+            Slopes::Differences(plant, _) => {
                 let after = DVector::from_vec(self.advance(plant, state.as_slice(), span)?);
-                let mut derivatives = DMatrix::zeros(state.len(), p + state.len());
-                let mut slope = |column: usize, plant: &Plant<f64>, start: &DVector<f64>| -> Result<(), Failure> {
-                    let end = DVector::from_vec(self.advance(plant, start.as_slice(), span)?);
-                    derivatives.set_column(column, &((end - &after) / DIFFERENCE));
-                    Ok(())
-                };
-                for (column, plant) in moved.iter().enumerate() {
-                    slope(column, plant, state)?;
-                }
+                let mut derivatives = DMatrix::zeros(state.len(), state.len());
                 for i in 0..state.len() {
                     let mut start = state.clone();
                     start[i] += DIFFERENCE;
-                    slope(p + i, plant, &start)?;
+                    let end = DVector::from_vec(self.advance(plant, start.as_slice(), span)?);
+                    derivatives.set_column(i, &((end - &after) / DIFFERENCE));
                 }
                 return Ok((after, derivatives));
             }

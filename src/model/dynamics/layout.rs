@@ -119,7 +119,7 @@ impl Default for SensorModel {
 pub const SENSOR_SIZE: usize = 7;
 
 /// What the sensor's numbers mean.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SensorError<T: Real> {
     /// What it adds to the force \[N\].
     pub force_bias: Vector3<T>,
@@ -127,6 +127,13 @@ pub struct SensorError<T: Real> {
     pub torque_bias: Vector3<T>,
     /// δ: the wrench acting at t is the one reported at t + δ \[s\].
     pub delay_s: T,
+}
+
+impl<T: Real> SensorError<T> {
+    /// A sensor without errors.
+    pub fn none() -> Self {
+        Self { force_bias: Vector3::zeros(), torque_bias: Vector3::zeros(), delay_s: T::zero() }
+    }
 }
 
 /// How a centre of mass across an axis is written.

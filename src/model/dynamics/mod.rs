@@ -21,7 +21,7 @@ pub use batch::{BatchFit, BatchWindow, BatchedWindow, Hypothesis};
 pub use innovations::WindowModel;
 pub use layout::{
     AddedEffect, AddedTable, DAMPING, FRICTION, INERTIA, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism,
-    SENSOR_SIZE, SIZE, SensorModel, UPPER,
+    SENSOR_SIZE, SIZE, SensorError, SensorModel, UPPER,
 };
 pub use learner::{DeclaredPhysics, DynamicsInput, DynamicsLearner, WindowInference};
 pub use posterior::{DynamicsPosterior, JointDynamics, PartDynamics};

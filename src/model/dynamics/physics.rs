@@ -16,26 +16,54 @@ use crate::model::KinematicFit;
 use crate::types::Label;
 
 impl DynamicsLearner {
-    /// The windows in which one joint moves, in joint space; of each joint the last `most`. Where several
-    /// move, what a wrong hypothesis of one does to the others costs seconds to find out, and misleads.
+    /// The windows in which joints move, in joint space; of those that move the same joints the last `most`.
+    /// Where several move, only with measured poses: hypotheses of an arm seen by clouds cost seconds a
+    /// window.
     pub fn batch(&self, fit: &KinematicFit, input: &DynamicsInput<'_>, most: usize) -> Vec<BatchWindow> {
-        let kinematics = kinematics_of(fit);
         let mut batch: Vec<BatchWindow> = Vec::new();
         for index in (0..input.windows.len().min(self.windows.len())).rev() {
-            let (moving, frozen) = self.moving(index, fit, input);
-            if moving.len() != 1 || batch.iter().filter(|w| w.moving == moving).count() >= most {
+            let Some(window) = self.batch_window(index, fit, input) else { continue };
+            if window.moving.len() > 1 && input.windows[index].direct.is_empty() {
                 continue;
             }
-            let Some(mut track) = joint_track(&self.source(index, &moving, fit, input), &kinematics) else { continue };
-            drop_spikes(&mut track);
-            if track.observations.len() < 3 {
-                continue;
+            if batch.iter().filter(|w| w.moving == window.moving).count() < most {
+                batch.push(window);
             }
-            let involved = self.involved(fit, &moving);
-            batch.push(BatchWindow { index, axes: kinematics.axes.clone(), frozen, moving, involved, track });
         }
         batch.reverse();
         batch
+    }
+
+    /// A window that is not learned in joint space, the last of `fit` and of `input`; `None` where nothing
+    /// moves in it.
+    pub fn unlearned_window(&self, fit: &KinematicFit, input: &DynamicsInput<'_>) -> Option<BatchWindow> {
+        let last = input.windows.len().checked_sub(1)?;
+        let mut learner = self.clone();
+        learner.windows.truncate(last);
+        while learner.windows.len() < last {
+            learner.keep_window(&[]);
+        }
+        learner.keep_window(input.contacts);
+        learner.batch_window(last, fit, input)
+    }
+
+    fn batch_window(&self, index: usize, fit: &KinematicFit, input: &DynamicsInput<'_>) -> Option<BatchWindow> {
+        let (moving, frozen) = self.moving(index, fit, input);
+        if moving.is_empty() {
+            return None;
+        }
+        let kinematics = kinematics_of(fit);
+        let mut track = joint_track(&self.source(index, &moving, fit, input), &kinematics)?;
+        drop_spikes(&mut track);
+        let involved = self.involved(fit, &moving);
+        (track.observations.len() >= 3).then_some(BatchWindow {
+            index,
+            axes: kinematics.axes,
+            frozen,
+            moving,
+            involved,
+            track,
+        })
     }
 
     /// The joints with what was declared of them and nothing else.

@@ -2,10 +2,12 @@
 
 use nalgebra::{DMatrix, DVector, Matrix2, Matrix3, Vector2, Vector3};
 
-use super::layout::{CENTER, DAMPING, FRICTION, INERTIA, LOWER, MASS, TILT, UPPER};
+use super::layout::{
+    AddedTable, CENTER, DAMPING, FRICTION, INERTIA, JointModel, LOWER, MASS, SensorError, TILT, UPPER,
+};
 use super::learner::DynamicsLearner;
 use crate::inference::Failure;
-use crate::mechanism::effects::EffectKind;
+use crate::mechanism::effects::{EffectKind, TableKind};
 use crate::mechanism::{JointType, Tree};
 use crate::types::Label;
 use crate::types::posterior::{InformedBy, Quantity};
@@ -191,6 +193,27 @@ impl DynamicsLearner {
         let axes: Vec<_> = mechanism.joints.iter().map(|m| m.joint.axis).collect();
         let frozen = vec![None; axes.len()];
         move |numbers| mechanism.tree(numbers.as_slice(), &axes, &frozen).ok()
+    }
+
+    /// The wrench sensor's errors, by numbers as [`DynamicsPosterior::mean`] has them.
+    pub fn sensor_error(&self, numbers: &DVector<f64>) -> SensorError<f64> {
+        self.mechanism.sensor_error(numbers.as_slice())
+    }
+
+    /// By joint, the root mean square of a force over time that has no name: what it will be is not known
+    /// \[N or N·m\].
+    pub fn unexplained_forces(&self, numbers: &DVector<f64>) -> Vec<f64> {
+        let of_joint = |(k, model): (usize, &JointModel)| {
+            let over_time =
+                |table: &&AddedTable| matches!(table.kind, TableKind::ForceOverTime | TableKind::FrictionOverTime);
+            let squares = model.tables.iter().enumerate().filter(|(_, table)| over_time(table)).map(|(t, table)| {
+                let first = self.mechanism.offset(k) + model.table_offset(t);
+                let entries = (first..first + table.nodes.len()).filter_map(|at| numbers.get(at));
+                entries.map(|entry| (entry * table.scale).powi(2)).sum::<f64>() / table.nodes.len().max(1) as f64
+            });
+            squares.sum::<f64>().sqrt()
+        };
+        self.mechanism.joints.iter().enumerate().map(of_joint).collect()
     }
 
     /// The numbers that the equations of motion hold: (joint, place in [`DynamicsPosterior::mean`]).

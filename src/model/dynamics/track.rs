@@ -9,10 +9,11 @@
 
 use std::collections::BTreeSet;
 
-use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
+use nalgebra::{DMatrix, DVector, Matrix3, Vector3, Vector6};
 
 use crate::math::{Pose, median};
 use crate::mechanism::WrenchSample;
+use crate::model::window::with_shared_error;
 use crate::model::{Axis, Contact, KinematicJoint, WindowObservations};
 use crate::types::{AppliedWrench, Label, Stamp};
 
@@ -411,9 +412,13 @@ fn frame_information(source: &TrackSource<'_>, kinematics: &TrackKinematics) -> 
                 }
                 let here = place(joint, &all[k][j]);
                 let sharing = all.iter().filter(|d| (place(joint, &d[j]) - here).norm() < SHARED_DISTANCE).count();
-                let raw = measured.information;
-                let direct = source.window.direct.contains_key(&joint.child);
-                let information = if direct { raw } else { shared(&raw, joint.radius, sharing as f64) };
+                let variance = match source.window.direct.contains_key(&joint.child) {
+                    true => 0.0,
+                    false => sharing as f64 * SHARED_ERROR * SHARED_ERROR,
+                };
+                let Some(information) = with_shared_error(&measured.information, joint.radius, variance) else {
+                    continue;
+                };
                 let (residual, information) = measured.compare(&information, &joint.center, &all[k][j]);
                 let weight = (STUDENT_FREEDOM + measured.dimensions())
                     / (STUDENT_FREEDOM + residual.dot(&(information * residual)));
@@ -437,17 +442,6 @@ fn place(joint: &KinematicJoint, pose: &Pose) -> Vector6<f64> {
     let turned = pose.rotation * Vector3::repeat(joint.radius / 3f64.sqrt());
     let center = pose.transform_point(&joint.center);
     Vector6::new(center.x, center.y, center.z, turned.x, turned.y, turned.z)
-}
-
-/// Information with the error that `sharing` frames have in common.
-fn shared(raw: &Matrix6<f64>, radius: f64, sharing: f64) -> Matrix6<f64> {
-    let scale = Vector6::new(radius, radius, radius, 1.0, 1.0, 1.0);
-    let scaled = Matrix6::from_fn(|i, j| raw[(i, j)] / (scale[i] * scale[j]));
-    let mut eigen = scaled.symmetric_eigen();
-    let floor = sharing * SHARED_ERROR * SHARED_ERROR;
-    eigen.eigenvalues.apply(|x| *x = if *x > 0.0 { 1.0 / (1.0 / *x + floor) } else { 0.0 });
-    let clean = eigen.recompose();
-    Matrix6::from_fn(|i, j| clean[(i, j)] * scale[i] * scale[j])
 }
 
 /// The touched label of a window's contacts, if any.
