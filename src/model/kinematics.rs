@@ -30,6 +30,8 @@ const TURNED: f64 = 0.1;
 const ALIGNED_SIGMA: f64 = 0.007;
 /// A reference pose's rotation that was not measured may be off by any angle: it does not matter \[rad⁻²\].
 const UNMEASURED_INFORMATION: f64 = 1.0;
+/// Information below this holds nothing, and pulls at nothing \[m⁻²\].
+const SAYS_NOTHING: f64 = 100.0;
 /// A window is tested for motion in this many blocks of frames.
 const REST_BLOCKS: usize = 6;
 /// Score at which rest is given up: far beyond χ² with `REST_BLOCKS` degrees of freedom, as frames
@@ -829,7 +831,7 @@ impl<'a> Problem<'a> {
         let scaled = Matrix6::from_fn(|i, j| information[(i, j)] / (scale[i] * scale[j]));
         let mut eigen = scaled.symmetric_eigen();
         let least = self.settings.view_error.powi(2);
-        eigen.eigenvalues.apply(|x| *x = if *x > 0.0 { (least + 1.0 / *x).sqrt() } else { 0.0 });
+        eigen.eigenvalues.apply(|x| *x = if *x > SAYS_NOTHING { (least + 1.0 / *x).sqrt() } else { 0.0 });
         let root = eigen.recompose();
         Matrix6::from_fn(|i, j| root[(i, j)] / scale[j])
     }
