@@ -218,7 +218,7 @@ impl TiltFrame {
     }
 
     /// Takes the axis's own two turns \[rad\] to the numbers: a turn by a f + b s adds b f − a s.
-    pub fn from_turns(&self, axis: &Axis) -> Matrix2<f64> {
+    pub fn turns_to_numbers(&self, axis: &Axis) -> Matrix2<f64> {
         let (first, second) = orthonormal_pair(&axis.direction);
         Matrix2::from_fn(|i, j| if j == 0 { -self.basis[i].dot(&second) } else { self.basis[i].dot(&first) })
     }

@@ -895,7 +895,7 @@ fn with_tilt(mut prior: Gaussian, model: &JointModel, fit: &KinematicFit) -> Gau
     let fitted = fit.joints.iter().position(|joint| joint.child == model.joint.child);
     if let Some(k) = fitted.filter(|_| model.tilt.shown > 0) {
         let at = fit.axis_offset(k);
-        let turns = model.tilt.from_turns(&fit.joints[k].axis);
+        let turns = model.tilt.turns_to_numbers(&fit.joints[k].axis);
         covariance += turns * fit.covariance.fixed_view::<2, 2>(at, at) * turns.transpose();
     }
     let precision = covariance.try_inverse().unwrap_or_else(|| Matrix2::identity() * LEAST_TILT.powi(-2));

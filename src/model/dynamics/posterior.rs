@@ -117,7 +117,7 @@ impl DynamicsLearner {
                 }
             };
             let turn = (!revolute && model.tilt.shown > 0).then(|| {
-                let back = model.tilt.from_turns(&model.joint.axis).transpose();
+                let back = model.tilt.turns_to_numbers(&model.joint.axis).transpose();
                 let tilt: Vector2<f64> = posterior.mean.fixed_rows::<2>(at + TILT).into();
                 (back * tilt, back * posterior.covariance.fixed_view::<2, 2>(at + TILT, at + TILT) * back.transpose())
             });
