@@ -51,7 +51,7 @@ fn a_model_that_explains_everything_is_adequate() {
 #[test]
 fn friction_that_was_not_declared_is_found() {
     for number in 0..2 {
-        let found = findings("plain", number, &DeclaredPhysics { friction: false, effects: Vec::new() });
+        let found = findings("plain", number, &DeclaredPhysics { friction: false, ..DeclaredPhysics::default() });
         assert_eq!(found.effects.first().map(|e| e.name.as_str()), Some("friction"), "{:?}", found.effects);
         let (object, _) = object("plain", 1.0, number);
         let friction = &found.effects[0].parameters["friction"];

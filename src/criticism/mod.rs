@@ -75,6 +75,9 @@ impl Critic {
         fit: &KinematicFit,
         input: &DynamicsInput<'_>,
     ) -> Result<usize, Failure> {
+        if !learner.declared().criticism {
+            return Ok(0);
+        }
         let batch = learner.batch(fit, input, MOST_WINDOWS);
         if batch.is_empty() {
             return Ok(0);

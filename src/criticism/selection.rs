@@ -41,15 +41,6 @@ const CHAIN_BUDGET: usize = 2500;
 const REFIT: (usize, usize) = (8, 2);
 /// Where several joints move, candidates are first fitted as little as this, and the best few refitted.
 const GLANCE: (usize, usize) = (4, 1);
-/// A window that needs this much process noise is far from explained: what is lacking shows little at first
-/// order, and is sought from far away. So it is with innovations this much too large or too much alike.
-const FAR: f64 = 1e4;
-const FAR_REDUCTION: f64 = 10.0;
-/// κ to come from, then.
-const WIDEST: f64 = 1e5;
-/// What is tried in any case, then: the forces that change most of a motion.
-const PLAIN: [EffectKind; 4] =
-    [EffectKind::Spring, EffectKind::GravityOffset, EffectKind::SelfClosing, EffectKind::SoftClose];
 const REFITTED_OF_CHAINS: usize = 2;
 /// Friction that was not declared starts from these shares of a joint's usual force.
 const FRICTION_STARTS: [f64; 2] = [0.3, 0.1];
@@ -248,7 +239,7 @@ impl Selector<'_> {
             current.leftover = leftover;
             let candidates = ranked.len().max(1) as f64;
             let mut trials: Vec<Trial> = Vec::new();
-            for candidate in self.shortlist(&current, &ranked) {
+            for candidate in self.shortlist(&ranked) {
                 if current.steps > budget {
                     break;
                 }
@@ -319,7 +310,7 @@ impl Selector<'_> {
         self.take(&mut with_first, first);
         let (ranked, _) = self.ranked(&with_first, friction_declared)?;
         let candidates = ranked.len().max(1) as f64;
-        for candidate in self.shortlist(&with_first, &ranked).into_iter().take(2) {
+        for candidate in self.shortlist(&ranked).into_iter().take(2) {
             let Ok(second) = self.best_trial(&with_first, &candidate) else { continue };
             if first.gain + second.gain > least + candidates.ln() {
                 self.take(&mut with_first, &second);
@@ -342,12 +333,11 @@ impl Selector<'_> {
                 let levels = FRICTION_STARTS.map(|share| vec![(share * force).ln()]);
                 levels.to_vec()
             }
-            _ if !self.is_far(current, candidate.addition.joint()) => return self.trial(current, candidate, effort),
-            _ => vec![candidate.start.clone(), Vec::new()],
+            _ => return self.trial(current, candidate, effort),
         };
         let mut bland = current.clone();
         bland.numbers.joints.clear();
-        // A delay's numbers are far from linear; all else is either near what is known or not.
+        // A delay's numbers are far from linear; friction starts high near what is known, low far from it.
         let both = candidate.addition == Addition::Delay;
         let mut best: Option<Trial> = None;
         let mut spent = 0;
@@ -366,13 +356,6 @@ impl Selector<'_> {
             spent += self.refine(&mut best)?;
         }
         Ok(Trial { spent, ..best })
-    }
-
-    /// Whether a window that moves a joint, or any for the sensor, is far from explained.
-    fn is_far(&self, current: &Selection, joint: Option<usize>) -> bool {
-        let concerned = current.components.iter().filter(|c| joint.is_none_or(|joint| c.joints.contains(&joint)));
-        let mut windows = concerned.filter_map(|c| c.fitted.as_ref()).flat_map(|fitted| &fitted.windows);
-        windows.any(|window| window.noise_scale >= FAR || window.reduction > FAR_REDUCTION)
     }
 
     /// Whether several joints move in a window.
@@ -477,7 +460,7 @@ impl Selector<'_> {
     }
 
     /// The best few of every joint, and the sensor's.
-    fn shortlist(&self, current: &Selection, ranked: &[Ranked]) -> Vec<Ranked> {
+    fn shortlist(&self, ranked: &[Ranked]) -> Vec<Ranked> {
         let mut by_place: BTreeMap<(bool, Option<usize>), Vec<&Ranked>> = BTreeMap::new();
         for candidate in ranked {
             // The sensor's last: they cost most.
@@ -501,14 +484,6 @@ impl Selector<'_> {
             }
             if worth.iter().any(by_direction) && !worth.iter().any(offset) {
                 worth.extend(candidates.iter().find(|c| offset(c)).map(|c| (*c).clone()));
-            }
-            let far =
-                candidates.first().and_then(|c| c.addition.joint()).is_some_and(|j| self.is_far(current, Some(j)));
-            for kind in PLAIN.iter().filter(|_| far) {
-                let own = |c: &Ranked| matches!(c.addition, Addition::Effect(_, own) if own == *kind);
-                if !worth.iter().any(own) {
-                    worth.extend(candidates.iter().find(|c| own(c)).map(|c| (*c).clone()));
-                }
             }
             shortlist.append(&mut worth);
         }
@@ -555,8 +530,7 @@ impl Selector<'_> {
                 c.fitted.as_ref().map(|f| f.windows[at].noise_scale)
             })
         };
-        let far = effort == GLANCE && self.is_far(current, addition.joint());
-        let scales: Vec<f64> = places.iter().map(|w| if far { WIDEST } else { scale(w).unwrap_or(10.0) }).collect();
+        let scales: Vec<f64> = places.iter().map(|w| scale(w).unwrap_or(10.0)).collect();
         let fitted = hypothesis.fit(&self.windows(&places), &x, &scales, effort)?;
         let rest = self.sensor_evidence(&additions) - self.sensor_evidence(&current.additions);
         let gain = fitted.log_evidence - before + rest;

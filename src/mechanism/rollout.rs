@@ -65,21 +65,33 @@ pub fn rollout<T: Real>(
     times_s: &[f64],
     step_max_s: f64,
 ) -> Result<Trajectory<T>, RolloutError> {
-    let carried = tracks.iter().any(|track| track.point != WrenchPoint::Recorded);
-    match SingleJoint::of(tree) {
-        Some(joint) if !carried => rollout_single(tree, &joint, initial, tracks, times_s, step_max_s),
-        _ => rollout_tree(tree, initial, tracks, times_s, step_max_s),
-    }
+    rollout_in(&mut Workspace::new(tree), tree, initial, tracks, times_s, step_max_s)
 }
 
-fn rollout_tree<T: Real>(
+/// [`rollout`] in a workspace of this tree's size, for many short ones.
+pub fn rollout_in<T: Real>(
+    workspace: &mut Workspace<T>,
     tree: &Tree<T>,
     initial: &State<T>,
     tracks: &[WrenchTrack<'_, T>],
     times_s: &[f64],
     step_max_s: f64,
 ) -> Result<Trajectory<T>, RolloutError> {
-    let mut workspace = Workspace::new(tree);
+    let carried = tracks.iter().any(|track| track.point != WrenchPoint::Recorded);
+    match SingleJoint::of(tree) {
+        Some(joint) if !carried => rollout_single(tree, &joint, initial, tracks, times_s, step_max_s),
+        _ => rollout_tree(workspace, tree, initial, tracks, times_s, step_max_s),
+    }
+}
+
+fn rollout_tree<T: Real>(
+    workspace: &mut Workspace<T>,
+    tree: &Tree<T>,
+    initial: &State<T>,
+    tracks: &[WrenchTrack<'_, T>],
+    times_s: &[f64],
+    step_max_s: f64,
+) -> Result<Trajectory<T>, RolloutError> {
     let mut state = initial.clone();
     let mut cursors = vec![0; tracks.len()];
     let mut wrenches: Vec<BodyWrench<T>> = Vec::with_capacity(tracks.len());
@@ -90,7 +102,7 @@ fn rollout_tree<T: Real>(
             for (track, cursor) in tracks.iter().zip(&mut cursors) {
                 wrenches.push(track.wrench(middle_s, cursor));
             }
-            step(tree, &mut state, &wrenches, Step { middle_s, length_s }, &mut workspace);
+            step(tree, &mut state, &wrenches, Step { middle_s, length_s }, workspace);
         }
         if !state.positions.iter().chain(&state.rates).all(|x| x.value().is_finite()) {
             return Err(RolloutError::Diverged { time_s: end_s });

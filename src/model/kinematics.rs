@@ -11,7 +11,7 @@
 use std::collections::BTreeMap;
 use std::rc::Rc;
 
-use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
+use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector2, Vector3, Vector6};
 use serde::{Deserialize, Serialize};
 
 use super::window::{Contact, PoseMeasurement, WindowObservations, with_shared_error};
@@ -45,6 +45,15 @@ pub struct Axis {
     pub direction: Vector3<f64>,
     /// The point of the axis nearest the child's reference point \[m\].
     pub point: Vector3<f64>,
+}
+
+impl Axis {
+    /// This after small turns \[rad\] about the two directions across it, in the order of the fit's covariance.
+    pub fn turned(&self, turn: &Vector2<f64>) -> Self {
+        let (first, second) = orthonormal_pair(&self.direction);
+        let direction = (self.direction + (first * turn.x + second * turn.y).cross(&self.direction)).normalize();
+        Self { direction, ..*self }
+    }
 }
 
 /// One joint of a hypothesis.

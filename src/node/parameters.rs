@@ -60,10 +60,15 @@ pub const QOS_TOPICS: [(&str, bool, bool, i64); 10] = [
     ("/diagnostics", false, true, 10),
 ];
 
+/// What the names of parameters begin with that hardly anyone sets.
+const RARE: &str = "kinematics.";
+
 /// All parameters, by name.
 #[derive(Clone, Debug)]
 pub struct Parameters {
     declared: BTreeMap<String, Declaration>,
+    /// Declared once they are given, see [`quality_declaration`].
+    rare: BTreeMap<String, Declaration>,
 }
 
 impl Default for Parameters {
@@ -180,7 +185,8 @@ impl Parameters {
         for (name, value, range, change, text) in own {
             declared.insert(name.to_owned(), Declaration::new(text, value, range, change));
         }
-        Self { declared }
+        let rare = declared.extract_if(.., |name, _| name.starts_with(RARE)).collect();
+        Self { declared, rare }
     }
 
     /// Sets what was given at the start, for this node. Returns what could not be used, a line each.
@@ -191,7 +197,8 @@ impl Parameters {
             if !bare && !names.matched_by(node) {
                 continue;
             }
-            let known = self.declared.get(name).cloned().or_else(|| quality_declaration(name));
+            let known = self.declared.get(name).or_else(|| self.rare.get(name)).cloned();
+            let known = known.or_else(|| quality_declaration(name));
             let Some(declaration) = known else {
                 unusable.push(format!("unknown parameter `{name}` ({source})"));
                 continue;

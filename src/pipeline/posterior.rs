@@ -2,12 +2,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use nalgebra::{DMatrix, Matrix3, Vector2, Vector3};
+use nalgebra::{DMatrix, Matrix3, Vector3};
 
 use super::poses::POSED_RADIUS;
 use super::{Learner, ParentEvidence, Pipeline};
 use crate::geometry::{HullProperties, hull_properties};
-use crate::math::{log_sum_exp, orthonormal_pair};
+use crate::math::log_sum_exp;
 use crate::mechanism::JointType;
 use crate::model::{Axis, DynamicsPosterior, JointDynamics, KinematicFit};
 use crate::registration::PartModel;
@@ -251,7 +251,7 @@ fn fitted_axis(
     let mut axis = joint.axis;
     let dynamics = learned_dynamics(option, known, child, joint_type);
     if let Some((turn, spread)) = dynamics.and_then(|dynamics| dynamics.turn) {
-        axis.direction = turned(&axis.direction, &turn);
+        axis = axis.turned(&turn);
         covariance.fixed_view_mut::<2, 2>(0, 0).copy_from(&spread);
     }
     let doubt = learner.doubt_beyond_least(child);
@@ -259,10 +259,4 @@ fn fitted_axis(
         covariance[(i, i)] += doubt * deviation.powi(2);
     }
     Some((axis, covariance))
-}
-
-/// A direction after small turns about the two directions across it \[rad\].
-fn turned(direction: &Vector3<f64>, turn: &Vector2<f64>) -> Vector3<f64> {
-    let (first, second) = orthonormal_pair(direction);
-    (direction + (first * turn.x + second * turn.y).cross(direction)).normalize()
 }

@@ -221,12 +221,14 @@ impl WindowCutter {
     }
 }
 
-/// Frames that are [`FRAME_SPACING`] apart at least, the first and the last among them.
+/// Frames that are [`FRAME_SPACING`] apart at least, the first and the last among them; all of those without
+/// clouds, as measured poses share no such error.
 fn spaced(frames: impl Iterator<Item = Frame>) -> Vec<Frame> {
     let mut kept: Vec<Frame> = Vec::new();
     let mut between = None;
     for frame in frames {
-        if kept.last().is_none_or(|before| frame.time_s - before.time_s >= FRAME_SPACING) {
+        let apart = |before: &Frame| frame.scans.is_empty() || frame.time_s - before.time_s >= FRAME_SPACING;
+        if kept.last().is_none_or(apart) {
             kept.push(frame);
             between = None;
         } else {

@@ -97,10 +97,18 @@ impl TrackedMechanism {
         let centers: Vec<Vector3<f64>> =
             fit.joints.iter().map(|joint| centers.get(&joint.child).copied()).collect::<Option<_>>()?;
         let trees = TreeFamily::new(dynamics.trees());
-        let tree = trees.tree(&posterior.mean)?;
+        let numbers = dynamics.along_published_axes(posterior.mean);
+        let tree = trees.tree(&numbers)?;
         if tree.body_count() != fit.joints.len() {
             return None;
         }
+        // As they are published.
+        let turn_of = |label: Label| posterior.joints.iter().find(|joint| joint.label == label)?.turn;
+        let joints = fit.joints.iter().map(|joint| match turn_of(joint.child) {
+            Some((turn, _)) => KinematicJoint { axis: joint.axis.turned(&turn), ..*joint },
+            None => *joint,
+        });
+        let joints: Vec<KinematicJoint> = joints.collect();
         let active: Vec<ActiveNumber> =
             dynamics.active_numbers().into_iter().map(|(joint, place)| ActiveNumber { joint, place }).collect();
         let covariance = DMatrix::from_fn(active.len(), active.len(), |i, j| {
@@ -120,11 +128,11 @@ impl TrackedMechanism {
             })
             .collect();
         Some(Self {
-            joints: fit.joints.clone(),
+            joints,
             trees,
-            sensor: dynamics.sensor_error(&posterior.mean),
-            unexplained: dynamics.unexplained_forces(&posterior.mean),
-            numbers: posterior.mean,
+            sensor: dynamics.sensor_error(&numbers),
+            unexplained: dynamics.unexplained_forces(&numbers),
+            numbers,
             active,
             covariance,
             tree,

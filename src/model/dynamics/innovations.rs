@@ -9,6 +9,8 @@
 //! The state holds the contact point's constant error beside (q, q̇). Derivatives are for fixed gains,
 //! by forward mode for one joint.
 
+use std::cell::RefCell;
+
 use nalgebra::{DMatrix, DVector, Vector3};
 use num_dual::DualSVec64;
 use rayon::prelude::*;
@@ -17,7 +19,7 @@ use super::layout::{Mechanism, SensorError};
 use super::track::{CONTACT_DEVIATION, Drive, JointTrack, Observation};
 use crate::inference::Failure;
 use crate::math::Real;
-use crate::mechanism::{Spatial, State, Tree, WrenchPoint, WrenchSample, WrenchTrack, rollout};
+use crate::mechanism::{Spatial, State, Tree, Workspace, WrenchPoint, WrenchSample, WrenchTrack, rollout_in};
 use crate::model::Axis;
 
 /// Longest step of the simulation \[s\]: half a wrench sample; trajectories of the midpoint step
@@ -123,6 +125,8 @@ const DIFFERENCE: f64 = 1e-6;
 pub(super) struct Plant<T: Real> {
     pub(super) tree: Tree<T>,
     sensor: SensorError<T>,
+    /// Lent to one simulation at a time.
+    workspace: RefCell<Workspace<T>>,
 }
 
 /// A plant with derivatives along some of the directions: first parameters, then q, then q̇.
@@ -184,19 +188,23 @@ impl WindowModel<'_> {
             state += &gain * innovation;
             passed.push(Passed { advance, rows, gain: Gain { gain, deviation } });
         }
-        let column = |i: usize| {
-            self.innovation_slopes(&passed, |advance| match &slopes {
-                Slopes::Forward(_) => Ok(advance.derivatives.column(i).into_owned()),
-                Slopes::Differences(_, moved) => {
-                    let end = self.advance(&moved[i], advance.before.as_slice(), advance.span)?;
-                    Ok((DVector::from_vec(end) - &advance.after) / DIFFERENCE)
-                }
-            })
-        };
         let columns: Vec<Vec<f64>> = match slopes {
-            Slopes::Forward(_) => (0..p).map(column).collect::<Result<_, _>>()?,
-            // In the order of `active`, so threads do not show in the result.
-            Slopes::Differences(..) => (0..p).into_par_iter().map(column).collect::<Result<_, _>>()?,
+            Slopes::Forward(_) => {
+                let column = |i: usize| {
+                    self.innovation_slopes(&passed, |advance| Ok(advance.derivatives.column(i).into_owned()))
+                };
+                (0..p).map(column).collect::<Result<_, _>>()?
+            }
+            Slopes::Differences(_, moved) => {
+                let column = |plant: Plant<f64>| {
+                    self.innovation_slopes(&passed, |advance| {
+                        let end = self.advance(&plant, advance.before.as_slice(), advance.span)?;
+                        Ok((DVector::from_vec(end) - &advance.after) / DIFFERENCE)
+                    })
+                };
+                // In the order of `active`, so threads do not show in the result.
+                moved.into_par_iter().map(column).collect::<Result<_, _>>()?
+            }
         };
         result.slopes = (0..result.whitened.len()).flat_map(|row| columns.iter().map(move |c| c[row])).collect();
         result.gains = passed.into_iter().map(|passed| passed.gain).collect();
@@ -305,7 +313,8 @@ impl WindowModel<'_> {
 
     pub(super) fn plant<T: Real>(&self, x: &[T]) -> Result<Plant<T>, Failure> {
         let tree = self.mechanism.tree(x, self.axes, self.frozen)?;
-        Ok(Plant { tree, sensor: self.mechanism.sensor_error(x) })
+        let workspace = RefCell::new(Workspace::new(&tree));
+        Ok(Plant { tree, sensor: self.mechanism.sensor_error(x), workspace })
     }
 
     fn forward(&self, x: &[f64], active: &[usize]) -> Result<Slopes, Failure> {
@@ -400,7 +409,7 @@ impl WindowModel<'_> {
 
     fn advance_evenly<T: Real>(
         &self,
-        Plant { tree, sensor }: &Plant<T>,
+        Plant { tree, sensor, workspace }: &Plant<T>,
         state: &[T],
         span: [f64; 2],
         contacts: &[Option<[f64; 2]>],
@@ -433,8 +442,9 @@ impl WindowModel<'_> {
             })
             .collect();
         let step_s = if n > 1 { CHAIN_STEP_S } else { STEP_S };
-        let run =
-            rollout(tree, &State::new(positions, rates), &tracks, &span, step_s).map_err(|_| Failure::Diverged)?;
+        let start = State::new(positions, rates);
+        let run = rollout_in(&mut workspace.borrow_mut(), tree, &start, &tracks, &span, step_s)
+            .map_err(|_| Failure::Diverged)?;
         let (positions, rates) = (run.positions(1), run.rates(1));
         Ok(self.moving.iter().map(|&j| positions[j]).chain(self.moving.iter().map(|&j| rates[j])).collect())
     }

@@ -32,6 +32,9 @@ const TYPICAL_RECORD_S: f64 = 4.0;
 /// A stop is believed if it raises the log evidence by this.
 const STOP_EVIDENCE: f64 = 4.0;
 
+/// A joint whose axis has turned by more than 10° since it was first learned is another: what windows said of it
+/// goes by where that axis was.
+const SAME_DIRECTION: f64 = 0.985;
 /// Directions are not known better than this \[rad\].
 const LEAST_TILT: f64 = 1e-4;
 
@@ -156,11 +159,13 @@ pub struct DeclaredPhysics {
     pub friction: bool,
     /// Effects by name.
     pub effects: Vec<EffectKind>,
+    /// Whether criticism may add others.
+    pub criticism: bool,
 }
 
 impl Default for DeclaredPhysics {
     fn default() -> Self {
-        Self { friction: true, effects: Vec::new() }
+        Self { friction: true, effects: Vec::new(), criticism: true }
     }
 }
 
@@ -192,6 +197,11 @@ impl DynamicsLearner {
             sensor: SensorModel::default(),
             sensor_prior: None,
         }
+    }
+
+    /// What is in the model from the start.
+    pub fn declared(&self) -> &DeclaredPhysics {
+        &self.declared
     }
 
     /// The same with other physics declared; before the first window.
@@ -247,7 +257,7 @@ impl DynamicsLearner {
             }
             let signature = (joint.joint_type, joint.parent.map(label_of), above);
             let same = |memory: &JointMemory| {
-                memory.signature == signature && memory.direction.dot(&joint.axis.direction) > 0.0
+                memory.signature == signature && memory.direction.dot(&joint.axis.direction) > SAME_DIRECTION
             };
             if !self.joints.get(&joint.child).is_some_and(same) {
                 self.forget(joint.child);

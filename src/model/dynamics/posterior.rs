@@ -216,9 +216,24 @@ impl DynamicsLearner {
         self.mechanism.joints.iter().enumerate().map(of_joint).collect()
     }
 
-    /// The numbers that the equations of motion hold: (joint, place in [`DynamicsPosterior::mean`]).
+    /// The numbers that the equations of motion hold: (joint, place in [`DynamicsPosterior::mean`]). Without the
+    /// directions of axes, so that motion stays along the axes that are published.
     pub fn active_numbers(&self) -> Vec<(usize, usize)> {
         let models = self.mechanism.joints.iter().enumerate();
-        models.flat_map(|(k, m)| m.active().into_iter().map(move |at| (k, self.mechanism.offset(k) + at))).collect()
+        let held = |at: &usize| !(TILT..TILT + 2).contains(at);
+        models
+            .flat_map(|(k, m)| m.active().into_iter().filter(held).map(move |at| (k, self.mechanism.offset(k) + at)))
+            .collect()
+    }
+
+    /// Numbers as [`DynamicsPosterior::mean`] has them, with every axis as it is published: hinges' by the
+    /// kinematic fit alone.
+    pub fn along_published_axes(&self, mut numbers: DVector<f64>) -> DVector<f64> {
+        for (k, model) in self.mechanism.joints.iter().enumerate() {
+            if model.joint.joint_type == JointType::Revolute {
+                numbers.rows_mut(self.mechanism.offset(k) + TILT, 2).fill(0.0);
+            }
+        }
+        numbers
     }
 }
