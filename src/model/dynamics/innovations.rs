@@ -139,7 +139,7 @@ struct Chunk {
 enum Slopes {
     Forward(Vec<Chunk>),
     /// The plant, and one for each parameter moved by [`DIFFERENCE`].
-    Differences(Plant<f64>, Vec<Plant<f64>>),
+    Differences(Box<Plant<f64>>, Vec<Plant<f64>>),
 }
 
 impl WindowModel<'_> {
@@ -338,7 +338,7 @@ impl WindowModel<'_> {
             self.plant(&moved)
         });
         let moved = moved.collect::<Result<_, Failure>>()?;
-        Ok(Slopes::Differences(self.plant(x)?, moved))
+        Ok(Slopes::Differences(Box::new(self.plant(x)?), moved))
     }
 
     /// The state after a span, and its derivatives: by parameters where they come with the simulation, then
