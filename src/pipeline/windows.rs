@@ -370,18 +370,24 @@ impl Readings {
 mod tests {
     use super::*;
 
-    fn times(rate_hz: f64, count: usize) -> Vec<f64> {
-        let frame = |k: usize| Frame { time_s: k as f64 / rate_hz, ..Frame::default() };
+    fn times(rate_hz: f64, count: usize, scans: &BTreeMap<Label, Vec<ScanPoint>>) -> Vec<f64> {
+        let frame = |k: usize| Frame { time_s: k as f64 / rate_hz, scans: scans.clone(), ..Frame::default() };
         spaced((0..count).map(frame)).iter().map(|frame| frame.time_s).collect()
     }
 
     #[test]
     fn frames_that_come_fast_are_thinned_out_from_the_first_to_the_last() {
-        assert_eq!(times(10.0, 5).len(), 5);
-        assert_eq!(times(15.0, 5).len(), 5);
-        let found = times(30.0, 8);
+        let scans = BTreeMap::from([(Label(1), Vec::new())]);
+        assert_eq!(times(10.0, 5, &scans).len(), 5);
+        assert_eq!(times(15.0, 5, &scans).len(), 5);
+        let found = times(30.0, 8, &scans);
         assert_eq!(found.len(), 4, "{found:?}");
         assert!(found[0] == 0.0 && (found[3] - 7.0 / 30.0).abs() < 1e-12, "{found:?}");
-        assert_eq!(times(60.0, 2).len(), 2);
+        assert_eq!(times(60.0, 2, &scans).len(), 2);
+    }
+
+    #[test]
+    fn measured_poses_are_all_kept() {
+        assert_eq!(times(60.0, 8, &BTreeMap::new()).len(), 8);
     }
 }
