@@ -64,14 +64,13 @@ fn eras(bag: &str) -> Vec<Era> {
             eras.extend(Era::of(pipeline));
         }
         for output in outputs {
-            let Output::Prediction { time_s, horizon_s, label, displacement, covariance_m2 } = output else { continue };
+            let Output::Prediction { time_s, horizon_s, label, .. } = output else { continue };
             // A prediction is made of what was learned by its stamp, though it comes a second later.
             let at = |era: &&mut Era| era.posterior.windows.last().is_none_or(|w| w.t1_s <= time_s + 1e-9);
             let Some(era) = eras.iter_mut().rev().find(at) else { continue };
             let center = era.posterior.parts.iter().find(|part| part.label == label);
             let center_in_world = center.map_or_else(Vector3::zeros, |part| part.com_in_world_m.into());
-            let prediction =
-                PartPrediction { label, horizon_s, displacement, center_in_world, covariance_m2, joint_position: None };
+            let Some(prediction) = PartPrediction::of(&output, center_in_world) else { continue };
             era.predicted.entry((time_s.to_bits(), horizon_s.to_bits())).or_default().insert(label, prediction);
         }
     };

@@ -89,19 +89,13 @@ impl Recording {
                     places.insert(label, displacement);
                     twists.insert(label, twist);
                 }
-                Output::Prediction { time_s, horizon_s, label, displacement, covariance_m2 } => {
+                Output::Prediction { time_s, label, .. } => {
                     if self.centers.is_empty() {
                         self.say_posterior(pipeline, counters, &frame, zero.plus_seconds(time_s))?;
                     }
                     let Some(center_in_world) = self.centers.get(&label).copied() else { continue };
-                    predicted.entry(zero.plus_seconds(time_s)).or_default().push(PartPrediction {
-                        label,
-                        horizon_s,
-                        displacement,
-                        center_in_world,
-                        covariance_m2,
-                        joint_position: None,
-                    });
+                    let prediction = PartPrediction::of(output, center_in_world);
+                    predicted.entry(zero.plus_seconds(time_s)).or_default().extend(prediction);
                 }
                 _ => {}
             }

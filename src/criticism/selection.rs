@@ -42,7 +42,8 @@ const REFIT: (usize, usize) = (8, 2);
 /// Where several joints move, candidates are first fitted as little as this, and the best few refitted.
 const GLANCE: (usize, usize) = (4, 1);
 const REFITTED_OF_CHAINS: usize = 2;
-/// Friction that was not declared starts from these shares of a joint's usual force.
+/// Friction that was not declared starts from these shares of a joint's usual force, near what is known and far
+/// from it.
 const FRICTION_STARTS: [f64; 2] = [0.3, 0.1];
 /// What is part of something richer is added first if it explains this share of what that does.
 const SIMPLER_SHARE: f64 = 0.3;
@@ -324,31 +325,27 @@ impl Selector<'_> {
 
     /// The best of a candidate's starts, refitted.
     fn best_trial(&self, current: &Selection, candidate: &Ranked) -> Result<Trial, Failure> {
-        let effort = if self.several() { GLANCE } else { REFIT };
-        let starts: Vec<Vec<f64>> = match candidate.addition {
-            Addition::Delay => DELAYS.map(|delay| vec![delay]).to_vec(),
-            // The numbers of a model without it stand in for it, and hold it down.
-            Addition::Friction(joint) => {
-                let force = self.workshop.learner.joint_scales(joint, self.workshop.fit).map_or(1.0, |s| s.force);
-                let levels = FRICTION_STARTS.map(|share| vec![(share * force).ln()]);
-                levels.to_vec()
-            }
-            _ => return self.trial(current, candidate, effort),
-        };
+        // The numbers of a model without it stand in for it, and hold it down: it starts from the prior's, too.
         let mut bland = current.clone();
         bland.numbers.joints.clear();
-        // A delay's numbers are far from linear; friction starts high near what is known, low far from it.
-        let both = candidate.addition == Addition::Delay;
+        let starts: Vec<(&Selection, f64)> = match candidate.addition {
+            Addition::Delay => {
+                [current, &bland].into_iter().flat_map(|from| DELAYS.map(|delay| (from, delay))).collect()
+            }
+            Addition::Friction(joint) => {
+                let force = self.workshop.learner.joint_scales(joint, self.workshop.fit).map_or(1.0, |s| s.force);
+                [current, &bland].into_iter().zip(FRICTION_STARTS.map(|share| (share * force).ln())).collect()
+            }
+            _ => return self.trial(current, candidate, if self.several() { GLANCE } else { REFIT }),
+        };
         let mut best: Option<Trial> = None;
         let mut spent = 0;
-        for (from, near) in [(current, true), (&bland, false)] {
-            for (_, start) in starts.iter().enumerate().filter(|(i, _)| both || near == (*i == 0)) {
-                let start = Ranked { start: start.clone(), ..candidate.clone() };
-                let Ok(trial) = self.trial(from, &start, GLANCE) else { continue };
-                spent += trial.spent;
-                if best.as_ref().is_none_or(|other| trial.gain > other.gain) {
-                    best = Some(trial);
-                }
+        for (from, start) in starts {
+            let start = Ranked { start: vec![start], ..candidate.clone() };
+            let Ok(trial) = self.trial(from, &start, GLANCE) else { continue };
+            spent += trial.spent;
+            if best.as_ref().is_none_or(|other| trial.gain > other.gain) {
+                best = Some(trial);
             }
         }
         let mut best = best.ok_or(Failure::Diverged)?;

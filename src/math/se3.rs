@@ -202,6 +202,23 @@ fn exponential_coefficients<T: Real>(theta_squared: T) -> (T, T, T) {
     }
 }
 
+/// What makes rotations of a body of this radius \[m\] lengths, as its translations are.
+pub fn length_scale(radius: f64) -> Vector6<f64> {
+    Vector6::new(radius, radius, radius, 1.0, 1.0, 1.0)
+}
+
+/// Information of (angular, linear) as that of lengths alone \[m⁻²\].
+pub fn in_lengths(information: &Matrix6<f64>, radius: f64) -> Matrix6<f64> {
+    let scale = length_scale(radius);
+    Matrix6::from_fn(|i, j| information[(i, j)] / (scale[i] * scale[j]))
+}
+
+/// The inverse of [`in_lengths`].
+pub fn from_lengths(information: &Matrix6<f64>, radius: f64) -> Matrix6<f64> {
+    let scale = length_scale(radius);
+    Matrix6::from_fn(|i, j| information[(i, j)] * scale[i] * scale[j])
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -15,7 +15,7 @@ use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector2, Vector3, Vector6};
 use serde::{Deserialize, Serialize};
 
 use super::window::{Contact, PoseMeasurement, WindowObservations, with_shared_error};
-use crate::math::{Pose, Screw, orthonormal_pair};
+use crate::math::{Pose, Screw, in_lengths, length_scale, orthonormal_pair};
 use crate::mechanism::JointType;
 use crate::types::Label;
 
@@ -836,9 +836,8 @@ impl<'a> Problem<'a> {
     /// Eᵀ, with E Eᵀ the covariance of the error that goes with a view, ξ as in [`PoseMeasurement`]: `view_error`
     /// in every direction, and what the measurement states, as outlines err alike in all frames.
     fn view_error(&self, information: &Matrix6<f64>, radius: f64) -> Matrix6<f64> {
-        let scale = Vector6::new(radius, radius, radius, 1.0, 1.0, 1.0);
-        let scaled = Matrix6::from_fn(|i, j| information[(i, j)] / (scale[i] * scale[j]));
-        let mut eigen = scaled.symmetric_eigen();
+        let scale = length_scale(radius);
+        let mut eigen = in_lengths(information, radius).symmetric_eigen();
         let least = self.settings.view_error.powi(2);
         eigen.eigenvalues.apply(|x| *x = if *x > SAYS_NOTHING { (least + 1.0 / *x).sqrt() } else { 0.0 });
         let root = eigen.recompose();

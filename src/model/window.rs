@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 use serde::{Deserialize, Serialize};
 
-use crate::math::Pose;
+use crate::math::{Pose, from_lengths, in_lengths};
 use crate::types::{AppliedWrench, Label};
 
 /// A part's displacement in one frame, as registration measured it.
@@ -102,10 +102,8 @@ impl WindowObservations {
 /// Information of a pose with an error of this variance \[m²\] that other measurements have too; rotations
 /// count by `radius` \[m\]. `None` where it is not positive semidefinite.
 pub fn with_shared_error(information: &Matrix6<f64>, radius: f64, variance: f64) -> Option<Matrix6<f64>> {
-    let scale = Vector6::new(radius, radius, radius, 1.0, 1.0, 1.0);
-    let scaled = Matrix6::from_fn(|i, j| information[(i, j)] / (scale[i] * scale[j]));
+    let scaled = in_lengths(information, radius);
     // (Λ⁻¹ + s I)⁻¹ = (I + s Λ)⁻¹ Λ, which stands where Λ is singular.
     let shared = (Matrix6::identity() + scaled * variance).cholesky()?.solve(&scaled);
-    let even = (shared + shared.transpose()) * 0.5;
-    Some(Matrix6::from_fn(|i, j| even[(i, j)] * scale[i] * scale[j]))
+    Some(from_lengths(&((shared + shared.transpose()) * 0.5), radius))
 }

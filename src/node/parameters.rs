@@ -67,7 +67,7 @@ const RARE: &str = "kinematics.";
 #[derive(Clone, Debug)]
 pub struct Parameters {
     declared: BTreeMap<String, Declaration>,
-    /// Declared once they are given, see [`quality_declaration`].
+    /// See [`Parameters::undeclared`].
     rare: BTreeMap<String, Declaration>,
 }
 
@@ -197,9 +197,7 @@ impl Parameters {
             if !bare && !names.matched_by(node) {
                 continue;
             }
-            let known = self.declared.get(name).or_else(|| self.rare.get(name)).cloned();
-            let known = known.or_else(|| quality_declaration(name));
-            let Some(declaration) = known else {
+            let Some(declaration) = self.declared.get(name).cloned().or_else(|| self.undeclared(name)) else {
                 unusable.push(format!("unknown parameter `{name}` ({source})"));
                 continue;
             };
@@ -211,6 +209,12 @@ impl Parameters {
             }
         }
         unusable
+    }
+
+    /// What is declared once it is given: all of it would make the list of parameters too long for one datagram,
+    /// and RustDDS 0.15.1 writes fragments of an answer that Fast DDS does not read.
+    fn undeclared(&self, name: &str) -> Option<Declaration> {
+        self.rare.get(name).cloned().or_else(|| quality_declaration(name))
     }
 
     /// Sets parameters, all or none. `unconfigured`: the lifecycle state is that.
@@ -374,9 +378,7 @@ fn qos_prefix(topic: &str, reads: bool) -> String {
     format!("qos_overrides.{}.{side}", topic.trim_start_matches("~/").trim_start_matches('/'))
 }
 
-/// A QoS parameter of one of the topics that have them. They are declared once they are given: all of
-/// them would make the list of parameters too long for one datagram, and RustDDS 0.15.1 writes fragments of
-/// an answer that Fast DDS does not read.
+/// A QoS parameter of one of the topics that have them.
 fn quality_declaration(name: &str) -> Option<Declaration> {
     QOS_TOPICS.into_iter().find_map(|(topic, reads, reliable, depth)| {
         let policy = name.strip_prefix(&qos_prefix(topic, reads))?;
@@ -483,7 +485,7 @@ mod tests {
     fn the_list_of_all_fits_into_a_datagram() {
         // In CDR a text is its length, itself, a zero, and what fills up to four bytes.
         let bytes: usize = Parameters::declared().names().map(|name| 4 + (name.len() + 1).next_multiple_of(4)).sum();
-        assert!(bytes < 1200, "{bytes} bytes: see `quality_declaration`");
+        assert!(bytes < 1200, "{bytes} bytes: see `undeclared`");
     }
 
     #[test]

@@ -316,17 +316,10 @@ impl Stream {
         let mut observed = None;
         for output in outputs {
             match output {
-                Output::Prediction { time_s, horizon_s, label, displacement, covariance_m2 } => {
+                Output::Prediction { time_s, label, .. } => {
                     let stamp = Stamp(zero.plus_seconds(time_s).0 - self.shift_ns);
                     let Some(center_in_world) = self.announcer.center(label) else { continue };
-                    predictions.entry(stamp).or_default().push(PartPrediction {
-                        label,
-                        horizon_s,
-                        displacement,
-                        center_in_world,
-                        covariance_m2,
-                        joint_position: None,
-                    });
+                    predictions.entry(stamp).or_default().extend(PartPrediction::of(&output, center_in_world));
                 }
                 Output::FirstLook(look) => self.learning.look(self.life, look),
                 Output::WindowClosed(window) => {

@@ -18,9 +18,9 @@ use crate::model::{
     Axis, Contact, KinematicJoint, KinematicSettings, PoseMeasurement, WindowObservations, fit_kinematics,
 };
 use crate::registration::{
-    AlignmentSettings, AxisSeed, JointFrame, JointPath, OUTLIER_COST, PartModel, Quadratic, ScanPoint, align,
-    fit_circle, fit_line, geometric_seeds, outline_quadratic, pose_factor, rays_near, search_path, seen_through,
-    truncated_cost,
+    AlignmentSettings, AxisSeed, JointFrame, JointPath, OUTLIER_COST, PartModel, Quadratic, ScanPoint, fit_circle,
+    fit_line, follow, geometric_seeds, outline_quadratic, pose_factor, rays_near, search_path, seen_through,
+    thinned_cost,
 };
 use crate::types::Label;
 
@@ -281,7 +281,7 @@ impl Scene<'_> {
             .filter(|(k, _)| !self.scan(label, *k).is_empty())
             .map(|(k, d)| {
                 let scan = self.scan(label, k);
-                let cost = truncated_cost(model, scan, scan.len() / 150, d);
+                let cost = thinned_cost(model, scan, d);
                 // Per point, what is turned away from the sensor does not count; per scan, new faces
                 // do not. Either may happen, so the smaller excess is taken.
                 let per_point = cost - baseline.cost;
@@ -360,8 +360,6 @@ impl Scene<'_> {
     fn free_track(&self, label: Label) -> Vec<Pose> {
         let model = &self.models[&label];
         let settings = AlignmentSettings { gate: 0.04, ..AlignmentSettings::default() };
-        let r = model.radius;
-        let prior = Matrix6::from_diagonal(&(Vector6::new(r * r, r * r, r * r, 1.0, 1.0, 1.0) * 2.5e3));
         let mut track: Vec<Pose> = Vec::with_capacity(self.frames.len());
         for k in 0..self.frames.len() {
             let last = track.last().copied().unwrap_or_else(|| self.start_of(label));
@@ -370,13 +368,9 @@ impl Scene<'_> {
                 [.., before, last] => *last * before.inverse() * *last,
                 _ => last,
             };
-            let cost = |pose: &Pose| truncated_cost(model, scan, scan.len() / 150, pose);
+            let cost = |pose: &Pose| thinned_cost(model, scan, pose);
             let start = if cost(&ahead) < cost(&last) { ahead } else { last };
-            track.push(if scan.is_empty() {
-                last
-            } else {
-                align(model, scan, &start, &prior, &settings, 6).displacement
-            });
+            track.push(if scan.is_empty() { last } else { follow(model, scan, &start, &settings).displacement });
         }
         track
     }

@@ -21,7 +21,7 @@ use crate::model::{
 };
 use crate::model::{DynamicsInput, DynamicsLearner, DynamicsPosterior, WindowInference};
 use crate::registration::{
-    AlignmentSettings, PartModel, ScanPoint, Surfel, SurfelAccumulator, fit_circle, fit_line, rays_near, truncated_cost,
+    AlignmentSettings, PartModel, ScanPoint, Surfel, SurfelAccumulator, fit_circle, fit_line, rays_near, thinned_cost,
 };
 use crate::structure::TreeDistribution;
 use crate::types::posterior::WindowRecord;
@@ -294,6 +294,11 @@ impl Learner {
         self.explained.get(&label).copied().unwrap_or_default().share_badly()
     }
 
+    /// What a part's scan costs at a known pose.
+    pub(super) fn usual_cost(&self, label: Label) -> f64 {
+        self.baselines.get(&label).map_or(0.0, |baseline| baseline.cost)
+    }
+
     /// Least and greatest position of each joint of the likeliest tree in the windows learned, by child
     /// \[m or rad\].
     pub fn ranges_seen(&self) -> BTreeMap<Label, (f64, f64)> {
@@ -331,7 +336,7 @@ impl Learner {
                 continue;
             }
             let count = scans.len() as f64;
-            let cost = |scan: &&Vec<ScanPoint>| truncated_cost(model, scan, scan.len() / 150, &Pose::identity());
+            let cost = |scan: &&Vec<ScanPoint>| thinned_cost(model, scan, &Pose::identity());
             self.baselines.insert(
                 *label,
                 Baseline {

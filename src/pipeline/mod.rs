@@ -35,7 +35,7 @@ pub use worker::{ClosedWindow, Learned, Looked, Worker};
 use crate::inference::SamplingSettings;
 use crate::math::Pose;
 use crate::model::{DeclaredPhysics, KinematicSettings, PoseMeasurement};
-use crate::registration::{AlignmentSettings, Quadratic, align, truncated_cost};
+use crate::registration::{AlignmentSettings, Quadratic, follow, thinned_cost};
 use crate::types::{Input, Label, Stamp};
 use evaluate::Scoring;
 use explain::{FEWEST_POINTS, measurement_of, travel};
@@ -457,9 +457,7 @@ impl Pipeline {
                 && scan.len() >= FEWEST_POINTS
                 && let Some(model) = learner.models.get(label)
             {
-                let r = model.radius;
-                let prior = Matrix6::from_diagonal(&(Vector6::new(r * r, r * r, r * r, 1.0, 1.0, 1.0) * 2.5e3));
-                let aligned = align(model, scan, &last, &prior, &settings, 6);
+                let aligned = follow(model, scan, &last, &settings);
                 let whole = Quadratic { hessian: aligned.factor.hessian(), gradient: aligned.factor.gradient() };
                 measurement = measurement_of(model, &whole, &aligned.displacement);
                 self.current.insert(*label, measurement.displacement);
@@ -499,7 +497,7 @@ impl Pipeline {
             else {
                 return false;
             };
-            let cost = |pose| truncated_cost(model, scan, scan.len() / 150, pose);
+            let cost = |pose| thinned_cost(model, scan, pose);
             travel(model, old, new) > 0.006 && cost(old) - cost(new) > MOVING_COST
         })
     }

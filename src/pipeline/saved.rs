@@ -17,7 +17,8 @@ use super::{Learner, Output, Pipeline, PipelineSettings};
 use crate::math::Pose;
 use crate::model::KinematicJoint;
 use crate::registration::{
-    JointFrame, OUTLIER_COST, PartModel, ScanPoint, Surfel, SurfelAccumulator, search_path, truncated_cost,
+    JointFrame, OUTLIER_COST, PartModel, ScanPoint, Surfel, SurfelAccumulator, search_path, thinned_cost,
+    truncated_cost,
 };
 use crate::types::{Label, Stamp};
 
@@ -224,10 +225,10 @@ impl Learner {
         let off = |(label, scan): (&Label, &Vec<ScanPoint>)| {
             let model = self.models.get(label).filter(|_| scan.len() >= FEWEST_POINTS)?;
             let displacement = self.displacements.get(label).copied().unwrap_or_else(Pose::identity);
-            let usual = self.baselines.get(label).map_or(0.0, |baseline| baseline.cost);
+            let usual = self.usual_cost(*label);
             // New faces match nothing, and that is no contradiction: what counts is where the points would
             // match if the part were where it should be.
-            let cost = truncated_cost(model, scan, scan.len() / 150, &displacement);
+            let cost = thinned_cost(model, scan, &displacement);
             (cost - usual > UNEXPLAINED.min(0.5 * (OUTLIER_COST - usual))).then_some(*label)
         };
         // A name for the world is nothing to be seen.

@@ -2,21 +2,18 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use nalgebra::{Matrix6, Vector3, Vector6};
+use nalgebra::{Vector3, Vector6};
 
 use super::explain::{FEWEST_POINTS, travel};
 use super::touch::Toucher;
 use super::{Frame, Learner};
 use crate::math::Pose;
-use crate::registration::{AlignmentSettings, PartModel, ScanPoint, align, truncated_cost};
+use crate::registration::{AlignmentSettings, PartModel, ScanPoint, follow, thinned_cost};
 use crate::tracking::{Account, Filter, FreePart, Presence};
 use crate::types::Label;
 
 /// Excess cost below which a pose explains a scan: it need not be registered.
 const WELL_EXPLAINED: f64 = 0.25;
-/// Information that holds a scan's pose where it was expected \[1/m²\], and steps of its registration.
-const SCAN_PRIOR: f64 = 2.5e3;
-const SCAN_STEPS: usize = 6;
 /// Points of a scan that are registered: neighbours say little more.
 const SCAN_POINTS: usize = 500;
 /// A pose that explains a scan badly may be off by this per unit of excess \[m\].
@@ -115,11 +112,11 @@ impl Whereabouts {
             let mean = scan.iter().map(|p| p.point_in_world).sum::<Vector3<f64>>() / scan.len() as f64;
             let joint = joint.filter(|pose| (pose.transform_point(&model.centroid) - mean).norm() < 3.0 * model.radius);
             let tool = toucher.track_of(label).filter(|_| learner.use_tool).unwrap_or(&[]);
-            let usual = learner.baselines.get(&label).map_or(0.0, |baseline| baseline.cost);
+            let usual = learner.usual_cost(label);
             let presence = self.presences.entry(label).or_default();
             let poses = self.scan_poses.entry(label).or_default();
             let known = joint.unwrap_or(place);
-            let excess = |pose: &Pose| truncated_cost(model, scan, scan.len() / 150, pose) - usual;
+            let excess = |pose: &Pose| thinned_cost(model, scan, pose) - usual;
             let went = mean - self.means.insert(label, mean).unwrap_or(mean);
             let pose = if excess(&known) < WELL_EXPLAINED {
                 known
@@ -163,8 +160,8 @@ impl Whereabouts {
             if !presence.is_lost(Account::Joint) || scan.len() < FEWEST_POINTS {
                 continue;
             }
-            let cost = |pose: &Pose| truncated_cost(model, scan, scan.len() / 150, pose);
-            let usual = learner.baselines.get(&label).map_or(0.0, |baseline| baseline.cost);
+            let cost = |pose: &Pose| thinned_cost(model, scan, pose);
+            let usual = learner.usual_cost(label);
             let found = filter.places_along(body).into_iter().map(|(q, pose)| (cost(&pose), q));
             if let Some((least, q)) = found.min_by(|a, b| a.0.total_cmp(&b.0))
                 && least - usual < 0.5 * presence.excess(Account::Joint).unwrap_or(0.0)
@@ -200,10 +197,8 @@ struct Clues<'a> {
 fn register(model: &PartModel, scan: &[ScanPoint], poses: &[(f64, Pose)], clues: &Clues<'_>) -> Pose {
     let Clues { now_s, known, tool, went, usual } = clues;
     let points: Vec<ScanPoint> = scan.iter().step_by((scan.len() / SCAN_POINTS).max(1)).copied().collect();
-    let r = model.radius;
-    let prior = Matrix6::from_diagonal(&(Vector6::new(r * r, r * r, r * r, 1.0, 1.0, 1.0) * SCAN_PRIOR));
-    let cost = |pose: &Pose| truncated_cost(model, &points, points.len() / 150, pose);
-    let fit = |start: &Pose| align(model, &points, start, &prior, &AlignmentSettings::default(), SCAN_STEPS);
+    let cost = |pose: &Pose| thinned_cost(model, &points, pose);
+    let fit = |start: &Pose| follow(model, &points, start, &AlignmentSettings::default());
     let Some(&(then_s, last)) = poses.last() else { return fit(known).displacement };
     let mut starts = vec![last];
     let followed = FreePart::followed(poses, model.centroid, model.radius, &[]);

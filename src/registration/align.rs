@@ -3,7 +3,7 @@
 use nalgebra::{Matrix6, Vector6};
 
 use super::{AlignmentSettings, PartModel, PoseFactor, ScanPoint, pose_factor};
-use crate::math::Pose;
+use crate::math::{Pose, length_scale};
 
 /// The outcome of an alignment.
 #[derive(Clone, Debug)]
@@ -14,6 +14,16 @@ pub struct Alignment {
     pub factor: PoseFactor,
     /// Whether the last step was below a tenth of a millimetre.
     pub converged: bool,
+}
+
+/// Information that holds a followed scan's pose where it was expected \[m⁻²\], and steps of its alignment.
+const FOLLOWED: (f64, usize) = (2.5e3, 6);
+
+/// Aligns a scan from where it is expected, held there only loosely (20 mm) where the geometry leaves it free.
+pub fn follow(model: &PartModel, scan: &[ScanPoint], start: &Pose, settings: &AlignmentSettings) -> Alignment {
+    let scale = length_scale(model.radius);
+    let prior = Matrix6::from_diagonal(&(scale.component_mul(&scale) * FOLLOWED.0));
+    align(model, scan, start, &prior, settings, FOLLOWED.1)
 }
 
 /// Aligns a scan by Gauss–Newton with a line search, at most `steps` steps.

@@ -7,7 +7,7 @@
 use nalgebra::{Matrix6, Vector3, Vector6};
 
 use super::{PartModel, ScanPoint};
-use crate::math::Pose;
+use crate::math::{Pose, from_lengths, in_lengths, length_scale};
 
 /// Cost of a point that matches nothing: the squared residual of three standard deviations, halved.
 pub const OUTLIER_COST: f64 = 4.5;
@@ -79,9 +79,8 @@ impl Quadratic {
 
     /// Gives every eigenvalue a new value by itself and the largest; where the optimum is stays.
     fn reshaped(&self, radius: f64, value: impl Fn(f64, f64) -> f64) -> Self {
-        let scale = Vector6::new(radius, radius, radius, 1.0, 1.0, 1.0);
-        let scaled = Matrix6::from_fn(|i, j| self.hessian[(i, j)] / (scale[i] * scale[j]));
-        let mut eigen = scaled.symmetric_eigen();
+        let scale = length_scale(radius);
+        let mut eigen = in_lengths(&self.hessian, radius).symmetric_eigen();
         let most = eigen.eigenvalues.max();
         let mut pull = eigen.eigenvectors.transpose() * self.gradient.component_div(&scale);
         for i in 0..6 {
@@ -91,8 +90,7 @@ impl Quadratic {
             eigen.eigenvalues[i] = after;
         }
         let gradient = (eigen.eigenvectors * pull).component_mul(&scale);
-        let reshaped = eigen.recompose();
-        Self { hessian: Matrix6::from_fn(|i, j| reshaped[(i, j)] * scale[i] * scale[j]), gradient }
+        Self { hessian: from_lengths(&eigen.recompose(), radius), gradient }
     }
 }
 
@@ -149,6 +147,14 @@ pub fn pose_factor(
         }
     }
     factor
+}
+
+/// Points of a scan that [`thinned_cost`] looks at, about.
+const COST_POINTS: usize = 150;
+
+/// [`truncated_cost`] by a few points of a scan: poses are compared with it all the time.
+pub fn thinned_cost(model: &PartModel, scan: &[ScanPoint], displacement: &Pose) -> f64 {
+    truncated_cost(model, scan, scan.len() / COST_POINTS, displacement)
 }
 
 /// Mean truncated cost per point, between 0 and `OUTLIER_COST`: for comparing far-apart poses.

@@ -18,6 +18,7 @@ use crate::{
         messages::Time as StampMessage,
     },
     math::{Pose, orthonormal_pair},
+    pipeline::Output,
     types::{
         Label, Stamp,
         finite::{NotFinite, check_finite},
@@ -69,6 +70,15 @@ pub struct PartPrediction {
     pub covariance_m2: Matrix3<f64>,
     /// Position of its joint in the description \[m or rad\]; `None` where it has none that moves, or floats.
     pub joint_position: Option<f64>,
+}
+
+impl PartPrediction {
+    /// What the pipeline predicts of a part, with its centre of mass \[m\]; of its joint nothing is said yet.
+    /// `None` of any other output.
+    pub fn of(output: &Output, center_in_world: Vector3<f64>) -> Option<Self> {
+        let Output::Prediction { horizon_s, label, displacement, covariance_m2, .. } = *output else { return None };
+        Some(Self { label, horizon_s, displacement, center_in_world, covariance_m2, joint_position: None })
+    }
 }
 
 /// Where the wrench to come is from.

@@ -5,10 +5,8 @@
 //! registered for this, so that nothing slides to where it fits.
 
 use crate::math::{Pose, softmax};
-use crate::registration::{PartModel, ScanPoint, truncated_cost};
+use crate::registration::{PartModel, ScanPoint, thinned_cost};
 
-/// Points of a scan looked at.
-const POINTS: usize = 150;
 /// Independent points that they are worth: neighbours share their errors.
 const INDEPENDENT: f64 = 20.0;
 /// Share of the newest frame in the smoothed excess.
@@ -58,7 +56,7 @@ impl Presence {
                 *excess = None;
                 continue;
             };
-            let now = (truncated_cost(model, scan, scan.len() / POINTS, &pose) - usual).max(0.0);
+            let now = (thinned_cost(model, scan, &pose) - usual).max(0.0);
             *excess = Some(excess.map_or(now, |before| before + NEWEST * (now - before)));
         }
     }
