@@ -111,17 +111,21 @@ pub fn solve(
             }
             let trial = &point + &step;
             let trial_cost = problem.cost(&trial).map(|c| c + prior_cost(&trial)).unwrap_or(f64::INFINITY);
+            let gained = trial_cost.is_finite() && trial_cost <= cost;
             let length = step.dot(&(&hessian * &step)).sqrt();
             if length < settings.tolerance && damping < 1.0 {
-                converged = true;
+                if gained {
+                    // So near, this linearization says what another would.
+                    here.cost = trial_cost - prior_cost(&trial);
+                    here.gradient += &here.curvature * &step;
+                    point = trial;
+                }
+                break;
             }
-            if trial_cost.is_finite() && trial_cost <= cost {
+            if gained {
                 point = trial;
                 damping = (damping * 0.1_f64).max(1e-7);
                 accepted = true;
-                break;
-            }
-            if converged {
                 break;
             }
             damping *= 10.0;

@@ -29,7 +29,7 @@ pub use inertia::{Spatial, SpatialInertia};
 pub use joint::JointType;
 pub use limits::{Approach, DEFAULT_LIMIT_SOFTNESS_S, Limit, LimitFlow};
 pub use parameters::{JointForces, JointParameters};
-pub use rollout::{RolloutError, Trajectory, rollout, rollout_in};
+pub use rollout::{Reach, RolloutError, Trajectory, advance_single, rollout, rollout_in};
 pub use single::{SingleJoint, SingleState};
 pub use step::{BodyWrench, State, Step, WrenchOrigin, step};
 pub use tree::{Body, Tree, TreeError};

@@ -114,34 +114,92 @@ fn rollout_tree<T: Real>(
 
 fn rollout_single<T: Real>(
     tree: &Tree<T>,
-    joint: &SingleJoint<'_, T>,
+    joint: &SingleJoint<T>,
     initial: &State<T>,
     tracks: &[WrenchTrack<'_, T>],
     times_s: &[f64],
     step_max_s: f64,
 ) -> Result<Trajectory<T>, RolloutError> {
-    let mut drives: Vec<Drive<'_, '_, T>> = tracks
-        .iter()
-        .filter(|track| tree.carriers[track.body].is_some())
-        .map(|track| Drive::new(joint.screw, track))
-        .collect();
+    let mut drives = drives(tree, joint, tracks);
     let mut positions = initial.positions.clone();
     let mut rates = initial.rates.clone();
     let mut state = SingleState::new(positions[joint.body], rates[joint.body]);
     let mut trajectory = empty_trajectory(tree.body_count(), times_s.len());
-    for (i, &end_s) in times_s.iter().enumerate() {
-        for Step { middle_s, length_s } in steps(times_s, i, step_max_s) {
-            let applied = drives.iter_mut().fold(T::zero(), |sum, drive| sum + drive.force(middle_s));
-            joint.step(&mut state, applied, middle_s, length_s);
+    for i in 0..times_s.len() {
+        let parameters = &tree.bodies()[joint.body].parameters;
+        for step in steps(times_s, i, step_max_s) {
+            let applied = drives.iter_mut().fold(T::zero(), |sum, drive| sum + drive.force(step.middle_s));
+            joint.step(parameters, &mut state, applied, step);
         }
-        if !(state.position.value().is_finite() && state.rate.value().is_finite()) {
-            return Err(RolloutError::Diverged { time_s: end_s });
-        }
+        check(&state, times_s[i])?;
         positions[joint.body] = state.position;
         rates[joint.body] = state.rate;
         trajectory.push(&positions, &rates);
     }
     Ok(trajectory)
+}
+
+/// Least and greatest position \[m or rad\] and rate \[m/s or rad/s\] at which a joint's forces were taken.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Reach {
+    /// q.
+    pub position: [f64; 2],
+    /// q̇.
+    pub rate: [f64; 2],
+}
+
+impl Default for Reach {
+    fn default() -> Self {
+        let nowhere = [f64::INFINITY, f64::NEG_INFINITY];
+        Self { position: nowhere, rate: nowhere }
+    }
+}
+
+impl Reach {
+    fn include(&mut self, (position, rate): (f64, f64)) {
+        for (range, value) in [(&mut self.position, position), (&mut self.rate, rate)] {
+            *range = [range[0].min(value), range[1].max(value)];
+        }
+    }
+}
+
+/// As [`rollout`] over one span, for `joint`, the only one of `tree` that moves, from its position and rate
+/// to those at the end; `tracks` are applied where they were recorded. `reach` takes in where it went.
+pub fn advance_single<T: Real>(
+    (tree, joint): (&Tree<T>, &SingleJoint<T>),
+    (position, rate): (T, T),
+    tracks: &[WrenchTrack<'_, T>],
+    span_s: [f64; 2],
+    step_max_s: f64,
+    mut reach: Option<&mut Reach>,
+) -> Result<(T, T), RolloutError> {
+    let mut drives = drives(tree, joint, tracks);
+    let parameters = &tree.bodies()[joint.body].parameters;
+    let mut state = SingleState::new(position, rate);
+    for step in steps(&span_s, 1, step_max_s) {
+        if let Some(reach) = &mut reach {
+            reach.include(state.middle(step.length_s));
+        }
+        let applied = drives.iter_mut().fold(T::zero(), |sum, drive| sum + drive.force(step.middle_s));
+        joint.step(parameters, &mut state, applied, step);
+    }
+    check(&state, span_s[1])?;
+    Ok((state.position, state.rate))
+}
+
+/// What drives a single joint.
+fn drives<'t, 'a, T: Real>(
+    tree: &Tree<T>,
+    joint: &SingleJoint<T>,
+    tracks: &'t [WrenchTrack<'a, T>],
+) -> Vec<Drive<'t, 'a, T>> {
+    let acting = tracks.iter().filter(|track| tree.carriers[track.body].is_some());
+    acting.map(|track| Drive::new(joint.screw, track)).collect()
+}
+
+fn check<T: Real>(state: &SingleState<T>, time_s: f64) -> Result<(), RolloutError> {
+    let finite = state.position.value().is_finite() && state.rate.value().is_finite();
+    if finite { Ok(()) } else { Err(RolloutError::Diverged { time_s }) }
 }
 
 fn empty_trajectory<T: Real>(body_count: usize, times: usize) -> Trajectory<T> {
@@ -182,8 +240,9 @@ impl<'t, 'a, T: Real> Drive<'t, 'a, T> {
     fn force(&mut self, time_s: f64) -> T {
         let place = self.track.locate(time_s, &mut self.cursor);
         if self.first != Some(place.first) {
+            let follows = place.first > 0 && self.first == Some(place.first - 1);
+            self.at_first = if follows { self.at_next } else { self.at_sample(place.first) };
             self.first = Some(place.first);
-            self.at_first = self.at_sample(place.first);
             self.at_next = self.at_sample(place.first + 1);
         }
         match place.weight {

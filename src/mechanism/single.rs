@@ -8,22 +8,20 @@ use super::inertia::Spatial;
 use super::joint::JointType;
 use super::limits::Approach;
 use super::parameters::JointParameters;
-use super::step::{ImplicitDamping, middle_rate, row};
+use super::step::{ImplicitDamping, Step, middle_rate, row};
 use super::tree::Tree;
 use crate::math::Real;
 use nalgebra::Vector3;
 
 /// One joint and all that moves with it.
-#[derive(Clone, Debug)]
-pub struct SingleJoint<'a, T: Real> {
+#[derive(Clone, Copy, Debug)]
+pub struct SingleJoint<T: Real> {
     /// Index of the body in its tree.
     pub body: usize,
     /// S, so that a world wrench w drives the joint with Sᵀ w.
     pub screw: Spatial<T>,
     /// Effective inertia, armature included \[kg or kg·m²\].
     pub inertia: T,
-    /// What the joint does by itself.
-    pub parameters: &'a JointParameters<T>,
     gravity: Gravity<T>,
 }
 
@@ -50,11 +48,17 @@ impl<T: Real> SingleState<T> {
     pub fn new(position: T, rate: T) -> Self {
         Self { position, rate, rate_before: rate }
     }
+
+    /// Position and rate that a step's forces are taken at.
+    pub(super) fn middle(&self, step_s: f64) -> (f64, f64) {
+        let (rate, before) = (self.rate.value(), self.rate_before.value());
+        (self.position.value() + 0.5 * step_s * rate, middle_rate(rate, before))
+    }
 }
 
-impl<'a, T: Real> SingleJoint<'a, T> {
+impl<T: Real> SingleJoint<T> {
     /// The only moving joint of a tree; `None` if there are more, or none.
-    pub fn of(tree: &'a Tree<T>) -> Option<Self> {
+    pub fn of(tree: &Tree<T>) -> Option<Self> {
         let [body] = *tree.moving_bodies() else { return None };
         let lumped = &tree.lumped[0];
         let joint = &tree.bodies()[body];
@@ -76,7 +80,6 @@ impl<'a, T: Real> SingleJoint<'a, T> {
             body,
             screw,
             inertia: screw.dot(&momentum) + joint.parameters.armature,
-            parameters: &joint.parameters,
             gravity,
         })
     }
@@ -93,10 +96,11 @@ impl<'a, T: Real> SingleJoint<'a, T> {
         }
     }
 
-    /// Advances `state` by `step_s` under the generalized force `applied` \[N or N·m\] of mid-step,
-    /// gravity not in it.
+    /// Advances `state` by a step under the generalized force `applied` \[N or N·m\] of mid-step,
+    /// gravity not in it; `parameters` is what the joint does by itself.
     #[inline]
-    pub fn step(&self, state: &mut SingleState<T>, applied: T, middle_s: f64, step_s: f64) {
+    pub fn step(&self, parameters: &JointParameters<T>, state: &mut SingleState<T>, applied: T, step: Step) {
+        let Step { middle_s, length_s: step_s } = step;
         let h = T::constant(step_s);
         let half = T::constant(0.5 * step_s);
         let rate = state.rate;
@@ -108,12 +112,12 @@ impl<'a, T: Real> SingleJoint<'a, T> {
             time_s: middle_s,
             step_s,
         };
-        let forces = self.parameters.forces(&joint);
+        let forces = parameters.forces(&joint);
         let damping = ImplicitDamping::new(forces.damping, self.inertia, step_s);
         let impulse =
             (self.inertia - damping.before) * rate + (applied + self.gravity_force(middle) + forces.force) * h;
         let approach = Approach { position: state.position, rate, gained: rate - state.rate_before, step_s };
-        let row = row(self.parameters, &forces, &approach);
+        let row = row(parameters, &forces, &approach);
         state.rate_before = rate;
         state.rate = row.proximal(self.inertia + damping.after, impulse, rate);
         state.position = row.limited_position(state.rate).unwrap_or_else(|| middle + state.rate * half);

@@ -283,6 +283,10 @@ impl<T: Real> Tree<T> {
     pub fn screws(&self, positions: &[T]) -> Vec<Spatial<T>> {
         let mut workspace = Workspace::new(self);
         self.update_kinematics(positions, &mut workspace);
+        self.screws_in(&workspace)
+    }
+
+    fn screws_in(&self, workspace: &Workspace<T>) -> Vec<Spatial<T>> {
         let mut screws = vec![Spatial::zero(); self.body_count()];
         for (k, &body) in self.moving.iter().enumerate() {
             screws[body] = workspace.screws[k];
@@ -292,9 +296,17 @@ impl<T: Real> Tree<T> {
 
     /// M(q), one row per body; rows of rigid joints are zero.
     pub fn mass_matrix(&self, positions: &[T]) -> DMatrix<T> {
-        let mut workspace = Workspace::new(self);
-        self.update_kinematics(positions, &mut workspace);
-        self.update_mass_matrix(&mut workspace);
+        self.screws_and_mass_matrix(positions, &mut Workspace::new(self)).1
+    }
+
+    /// [`Self::screws`] and [`Self::mass_matrix`] in a workspace of this tree's size.
+    pub fn screws_and_mass_matrix(
+        &self,
+        positions: &[T],
+        workspace: &mut Workspace<T>,
+    ) -> (Vec<Spatial<T>>, DMatrix<T>) {
+        self.update_kinematics(positions, workspace);
+        self.update_mass_matrix(workspace);
         let n = self.moving.len();
         let mut matrix = DMatrix::zeros(self.body_count(), self.body_count());
         for (i, &row) in self.moving.iter().enumerate() {
@@ -302,7 +314,7 @@ impl<T: Real> Tree<T> {
                 matrix[(row, column)] = workspace.mass_matrix[i * n + j];
             }
         }
-        matrix
+        (self.screws_in(workspace), matrix)
     }
 
     /// c(q, q̇) + g(q), one per body: the generalized forces that keep the rates as they are.

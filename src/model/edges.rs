@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use nalgebra::{Matrix6, Vector3, Vector6};
 use serde::{Deserialize, Serialize};
 
-use super::kinematics::{Axis, KinematicJoint, KinematicSettings, fit_kinematics};
+use super::kinematics::{Axis, KinematicJoint, KinematicSettings, SharedByFits, fit_edge};
 use super::window::{Contact, PoseMeasurement, WindowObservations};
 use crate::math::{Pose, Screw, median, orthonormal_pair};
 use crate::mechanism::JointType;
@@ -144,11 +144,13 @@ fn blurred(
     PoseMeasurement { information: (information + information.transpose()) * 0.5, ..*relative }
 }
 
-/// Evidence of no motion at all relative to the parent \[nats\], and what each window adds to it.
+/// Evidence of no motion at all relative to the parent \[nats\], and what each window adds to it. `shared` is
+/// that of other fits of the part to these windows.
 pub fn rigid_evidence(
     part: &EdgePart,
     windows: &[WindowObservations],
     settings: &KinematicSettings,
+    shared: &SharedByFits,
 ) -> (f64, Vec<f64>) {
     let still = KinematicJoint {
         parent: None,
@@ -162,19 +164,19 @@ pub fn rigid_evidence(
     let references: Vec<&WindowObservations> = windows.iter().collect();
     let positions = windows.iter().map(|w| vec![vec![0.0; w.times_s.len()]]).collect();
     let frozen = KinematicSettings { steps: 2, ..*settings };
-    let fit = fit_kinematics(vec![still], positions, &references, &frozen);
+    let fit = fit_edge(still, positions, &references, &frozen, shared);
     (-TEMPERATURE * fit.cost, fit.window_costs.iter().map(|cost| -TEMPERATURE * cost).collect())
 }
 
 /// Fits one moving type from each start axis and keeps the best; `resting`: the windows in which the
-/// part keeps its place on the parent.
+/// part keeps its place on the parent. `shared` is that of other fits of the part to these windows.
 pub fn moving_evidence(
     part: &EdgePart,
     joint_type: JointType,
     starts: &[Axis],
-    windows: &[WindowObservations],
-    resting: &[bool],
+    (windows, resting): (&[WindowObservations], &[bool]),
     settings: &KinematicSettings,
+    shared: &SharedByFits,
 ) -> Option<EdgeFit> {
     let references: Vec<&WindowObservations> = windows.iter().collect();
     starts
@@ -192,7 +194,7 @@ pub fn moving_evidence(
             };
             let positions =
                 windows.iter().zip(resting).map(|(w, rests)| vec![start_positions(&joint, w, *rests)]).collect();
-            let fit = fit_kinematics(vec![joint], positions, &references, settings);
+            let fit = fit_edge(joint, positions, &references, settings, shared);
             let parameters = joint.axis_parameters();
             let width = joint.axis_point_prior();
             let priors = [AXIS_DIRECTION_PRIOR, AXIS_DIRECTION_PRIOR, width, width];

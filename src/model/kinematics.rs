@@ -8,6 +8,7 @@
 //! Gauss–Newton with Student-t weights; each window's joint positions and contact points are
 //! eliminated, so the cost is linear in the number of windows.
 
+use std::cell::OnceCell;
 use std::collections::BTreeMap;
 use std::rc::Rc;
 
@@ -210,7 +211,7 @@ pub struct KinematicFit {
     pub moves: Vec<Vec<usize>>,
     /// What each window adds to the cost, priors apart.
     pub window_costs: Vec<f64>,
-    /// By how much ln |information| of all that windows share would fall without each.
+    /// By how much ln |information| of all that windows share would fall without each; none from [`fit_edge`].
     pub window_information: Vec<f64>,
     /// Whether the last step was small.
     pub converged: bool,
@@ -247,30 +248,60 @@ pub fn fit_kinematics(
     windows: &[&WindowObservations],
     settings: &KinematicSettings,
 ) -> KinematicFit {
-    let mut problem = Problem::new(joints, positions, windows, settings);
-    let mut cost = problem.cost();
+    let shared = SharedByFits::default();
+    let (problem, cost, converged) = solved(Problem::new(joints, positions, windows, settings, &shared));
+    problem.finish(cost, converged, true)
+}
+
+/// As [`fit_kinematics`] for one joint, without the windows' information; `shared` is that of other fits of
+/// the same part to the same windows.
+pub fn fit_edge(
+    joint: KinematicJoint,
+    positions: Vec<Vec<Vec<f64>>>,
+    windows: &[&WindowObservations],
+    settings: &KinematicSettings,
+    shared: &SharedByFits,
+) -> KinematicFit {
+    let (problem, cost, converged) = solved(Problem::new(vec![joint], positions, windows, settings, shared));
+    problem.finish(cost, converged, false)
+}
+
+/// What fits of the same parts to the same windows have in common, made by the first.
+#[derive(Default)]
+pub struct SharedByFits {
+    /// Information of every measurement by itself.
+    information: OnceCell<Rc<FaceInformation>>,
+    /// [`Problem::view_error`] of every measurement.
+    view_errors: OnceCell<FaceInformation>,
+}
+
+/// The optimum of a problem, its cost, and whether the last step was small.
+fn solved(mut problem: Problem<'_>) -> (Problem<'_>, f64, bool) {
+    let mut of_windows = problem.windows_cost();
     let mut damping = 1e-6;
     let mut converged = false;
     let mut tied = false;
-    for step in 0..settings.steps {
-        if step == settings.steps / 2 || (converged && !tied) {
+    for step in 0..problem.settings.steps {
+        if step == problem.settings.steps / 2 || (converged && !tied) {
             problem.share_errors();
             problem.free_movers();
             problem.tie_rests();
+            of_windows = problem.windows_cost();
             tied = true;
             converged = false;
         }
         let systems = problem.linearize();
         problem.weigh_alignments(&systems);
-        let cost_before = problem.cost();
+        let cost_before = problem.prior_cost() + of_windows;
         let mut accepted = false;
         for _ in 0..6 {
             let trial = problem.stepped(&systems, damping);
-            let trial_cost = trial.cost();
+            let trial_of_windows = trial.windows_cost();
+            let trial_cost = trial.prior_cost() + trial_of_windows;
             if trial_cost.is_finite() && trial_cost <= cost_before + 1e-9 {
                 converged = cost_before - trial_cost < 1e-6 * (1.0 + cost_before.abs());
                 problem = trial;
-                cost = trial_cost;
+                of_windows = trial_of_windows;
                 damping = (damping * 0.2_f64).max(1e-9);
                 accepted = true;
                 break;
@@ -284,7 +315,8 @@ pub fn fit_kinematics(
             break;
         }
     }
-    problem.finish(cost, converged)
+    let cost = problem.prior_cost() + of_windows;
+    (problem, cost, converged)
 }
 
 /// One window's normal equations with its local unknowns still in.
@@ -322,6 +354,7 @@ struct Problem<'a> {
     /// By joint: the information of the pose that its child's displacements are counted from, where a
     /// pose topic measures them.
     references: Vec<Option<Matrix6<f64>>>,
+    shared: &'a SharedByFits,
 }
 
 impl<'a> Problem<'a> {
@@ -330,6 +363,7 @@ impl<'a> Problem<'a> {
         positions: Vec<Vec<Vec<f64>>>,
         windows: &'a [&'a WindowObservations],
         settings: &'a KinematicSettings,
+        shared: &'a SharedByFits,
     ) -> Self {
         let by_label = joints.iter().enumerate().map(|(i, j)| (j.child, i)).collect();
         let reference = |j: &KinematicJoint| windows.iter().find_map(|w| w.direct.get(&j.child)).copied();
@@ -348,11 +382,13 @@ impl<'a> Problem<'a> {
             tool_offset: Vector3::zeros(),
             by_label,
             references,
+            shared,
         };
         problem.alignments = vec![0.0; problem.joints.len()];
         problem.face_errors = vec![[Vector6::zeros(); 2]; problem.joints.len()];
         problem.separate_frames();
-        problem.information = Rc::new(problem.informations(|_, _, _| 1.0));
+        let alone = || Rc::new(problem.informations(|_, _, _| 1.0));
+        problem.information = Rc::clone(shared.information.get_or_init(alone));
         problem.contact_points = (0..windows.len()).map(|w| problem.initial_contact_points(w)).collect();
         problem
     }
@@ -393,14 +429,17 @@ impl<'a> Problem<'a> {
 
     /// Information of every measurement, given how many frames share its registration error.
     fn informations(&self, sharing: impl Fn(usize, usize, usize) -> f64) -> FaceInformation {
-        let one = |w: usize, j: usize, frame: usize, face: usize| {
+        self.by_measurement(|w, j, frame, face| {
             let joint = &self.joints[j];
             let raw = self.measured(w, j, frame, face)?.information;
             if self.references[j].is_some() {
                 return Some(raw);
             }
             with_shared_error(&raw, joint.radius, sharing(w, j, frame) * self.settings.shared_error.powi(2))
-        };
+        })
+    }
+
+    fn by_measurement(&self, one: impl Fn(usize, usize, usize, usize) -> Option<Matrix6<f64>>) -> FaceInformation {
         (0..self.windows.len())
             .map(|w| {
                 let frames = self.windows[w].times_s.len();
@@ -442,7 +481,8 @@ impl<'a> Problem<'a> {
         (freedom + dimensions) / (freedom + chi_squared)
     }
 
-    fn cost(&self) -> f64 {
+    /// The cost but for what the windows add.
+    fn prior_cost(&self) -> f64 {
         let mut cost = 0.5 * self.tool_offset.norm_squared() / self.settings.tool_offset_sigma.powi(2);
         for (joint, information) in self.joints.iter().zip(&self.alignments) {
             let turn = joint.alignment(0.0).map_or([0.0; 2], |(turn, _)| turn);
@@ -456,7 +496,11 @@ impl<'a> Problem<'a> {
         for joint in self.joints.iter().filter(|j| j.joint_type == JointType::Revolute) {
             cost += 0.5 * (joint.axis.point - joint.center).norm_squared() / joint.axis_point_prior().powi(2);
         }
-        cost + (0..self.windows.len()).map(|w| self.window_cost(w)).sum::<f64>()
+        cost
+    }
+
+    fn windows_cost(&self) -> f64 {
+        (0..self.windows.len()).map(|w| self.window_cost(w)).sum()
     }
 
     /// What a window adds to the cost.
@@ -531,7 +575,7 @@ impl<'a> Problem<'a> {
             let displacements = forward(&self.joints, |j| self.positions[w][j][frame]);
             let columns = self.twist_columns(w, frame, &displacements);
             for row in self.pose_rows(w, frame, &displacements, &columns) {
-                accumulate(&mut system, &row.jacobian, &row.information, &row.residual);
+                system.add_pose(&row);
             }
             for (c, x, sigma) in touches {
                 let Some(&j) = self.by_label.get(&window.contacts[*c].label) else { continue };
@@ -571,13 +615,10 @@ impl<'a> Problem<'a> {
             let into_body = (Pose::from_translation(-joint.center) * displacements[j].inverse()).adjoint_matrix();
             for r in self.residuals(w, j, frame, &displacements[j]) {
                 let weight = self.student_weight(r.chi_squared(), r.dimensions);
-                let mut jacobian: Vec<_> = columns[j].iter().map(|(at, v)| (*at, into_body * v)).collect();
-                if let Some(error) = r.error {
-                    let unit = |i: usize| -Matrix6::identity().column(i);
-                    jacobian.extend((0..6).map(|i| (Slot::Global(axes + 12 * j + 6 * error + i), unit(i))));
-                }
+                let jacobian = columns[j].iter().map(|(at, v)| (*at, into_body * v)).collect();
+                let error = r.error.map(|error| axes + 12 * j + 6 * error);
                 let information = r.information * weight;
-                rows.push(PoseRow { joint: j, face: r.face, jacobian, information, residual: r.value });
+                rows.push(PoseRow { joint: j, face: r.face, jacobian, error, information, residual: r.value });
             }
         }
         rows
@@ -813,10 +854,10 @@ impl<'a> Problem<'a> {
 
     /// Covariance of the gradient in the global unknowns by registration errors that go with the view: of each
     /// part and its faces a Gaussian process over where the part is, none at the reference configuration.
-    fn drift_of_views(&self, systems: &[WindowSystem]) -> DMatrix<f64> {
+    fn drift_of_views(&self, solves: &[Option<LocalSolve>]) -> DMatrix<f64> {
         let globals = self.global_count();
         let mut drift = DMatrix::zeros(globals, globals);
-        for (j, views) in self.views(systems).iter().enumerate() {
+        for (j, views) in self.views(solves).iter().enumerate() {
             let joint = &self.joints[j];
             let start = Look::at(joint, &Pose::identity());
             let likeness = |a: &Look, b: &Look| (-a.distance(b) / self.settings.view_distance).exp();
@@ -846,12 +887,18 @@ impl<'a> Problem<'a> {
 
     /// By joint and faces: the views of its child, with the gradient in the global unknowns (columns) that one
     /// `view_error` in each of six directions causes. Looks within `shared_distance` are one view.
-    fn views(&self, systems: &[WindowSystem]) -> Vec<[Vec<(Look, DMatrix<f64>)>; 2]> {
+    /// `solves` are those of the undamped systems.
+    fn views(&self, solves: &[Option<LocalSolve>]) -> Vec<[Vec<(Look, DMatrix<f64>)>; 2]> {
+        let errors = self.shared.view_errors.get_or_init(|| {
+            self.by_measurement(|w, j, frame, face| {
+                let raw = self.measured(w, j, frame, face).filter(|_| self.references[j].is_none())?;
+                Some(self.view_error(&raw.information, self.joints[j].radius))
+            })
+        });
         let globals = self.global_count();
         let mut views: Vec<[Vec<(Look, DMatrix<f64>)>; 2]> = self.joints.iter().map(|_| Default::default()).collect();
-        for (w, (window, system)) in self.windows.iter().zip(systems).enumerate() {
-            let Some(local) = system.local.clone().cholesky() else { continue };
-            let coupling = local.solve(&system.coupling);
+        for (w, (window, solve)) in self.windows.iter().zip(solves).enumerate() {
+            let Some(LocalSolve { coupling, .. }) = solve else { continue };
             for frame in 0..window.times_s.len() {
                 let displacements = forward(&self.joints, |j| self.positions[w][j][frame]);
                 let columns = self.twist_columns(w, frame, &displacements);
@@ -869,10 +916,14 @@ impl<'a> Problem<'a> {
                         views.push((look, DMatrix::zeros(globals, 6)));
                     }
                     let pull = &mut views[index].1;
-                    let Some(raw) = self.measured(w, row.joint, frame, row.face) else { continue };
-                    let error = self.view_error(&raw.information, joint.radius);
+                    let Some(error) = &errors[w][row.joint][frame][row.face] else { continue };
+                    let weighted = error * row.information;
+                    if let Some(at) = row.error {
+                        let mut own = pull.fixed_rows_mut::<6>(at);
+                        own -= weighted.transpose();
+                    }
                     for (at, column) in &row.jacobian {
-                        let value = (error * row.information * column).transpose();
+                        let value = (weighted * column).transpose();
                         match *at {
                             Slot::Global(row) => pull.row_mut(row).zip_apply(&value, |p, v| *p += v),
                             Slot::Local(row) => pull.ger(-1.0, &coupling.row(row).transpose(), &value.transpose(), 1.0),
@@ -884,12 +935,13 @@ impl<'a> Problem<'a> {
         views
     }
 
-    fn finish(self, cost: f64, converged: bool) -> KinematicFit {
+    fn finish(self, cost: f64, converged: bool, weigh_windows: bool) -> KinematicFit {
         let systems = self.linearize();
-        let (matrix, _, _) = self.reduced(&systems, 0.0);
+        let (matrix, _, solves) = self.reduced(&systems, 0.0);
         let globals = matrix.nrows();
-        let window_information = window_information(&matrix, &systems);
-        let drift = self.drift_of_views(&systems);
+        let window_information =
+            if weigh_windows { window_information(&matrix, &systems, &solves) } else { Vec::new() };
+        let drift = self.drift_of_views(&solves);
         let mut covariance = matrix.cholesky().map_or_else(|| DMatrix::identity(globals, globals), |c| c.inverse());
         covariance += &covariance * drift * &covariance;
         let covariance = (&covariance + covariance.transpose()) * 0.5;
@@ -918,16 +970,20 @@ struct LocalSolve {
 }
 
 /// By how much ln |matrix| falls without each window's share of it; greatest where nothing else holds.
-fn window_information(matrix: &DMatrix<f64>, systems: &[WindowSystem]) -> Vec<f64> {
+fn window_information(
+    matrix: &DMatrix<f64>,
+    systems: &[WindowSystem],
+    solves: &[Option<LocalSolve>],
+) -> Vec<f64> {
     let log_determinant = |matrix: DMatrix<f64>| {
         matrix.cholesky().map_or(f64::NEG_INFINITY, |c| 2.0 * c.l_dirty().diagonal().map(f64::ln).sum())
     };
     let whole = log_determinant(matrix.clone());
     systems
         .iter()
-        .map(|system| {
-            let coupled =
-                system.local.clone().cholesky().map(|c| system.coupling.transpose() * c.solve(&system.coupling));
+        .zip(solves)
+        .map(|(system, solve)| {
+            let coupled = solve.as_ref().map(|solve| system.coupling.transpose() * &solve.coupling);
             let own = coupled.map_or_else(|| system.global.clone(), |coupled| &system.global - coupled);
             (whole - log_determinant(matrix - own)).clamp(0.0, f64::MAX)
         })
@@ -959,6 +1015,8 @@ struct PoseRow {
     joint: usize,
     face: usize,
     jacobian: Vec<(Slot, Vector6<f64>)>,
+    /// The first of the six global unknowns that are its rigid error: it goes with −1 of each.
+    error: Option<usize>,
     information: Matrix6<f64>,
     residual: Vector6<f64>,
 }
@@ -967,6 +1025,57 @@ struct PoseRow {
 enum Slot {
     Local(usize),
     Global(usize),
+}
+
+impl WindowSystem {
+    /// Adds a pose's share: Jᵀ Λ J and Jᵀ Λ r.
+    fn add_pose(&mut self, row: &PoseRow) {
+        let pull = row.information * row.residual;
+        for (i, (at, column)) in row.jacobian.iter().enumerate() {
+            let weighted = row.information * column;
+            let slope = column.dot(&pull);
+            match *at {
+                Slot::Local(at) => self.local_gradient[at] += slope,
+                Slot::Global(at) => self.global_gradient[at] += slope,
+            }
+            for (k, (other, other_column)) in row.jacobian[..=i].iter().enumerate() {
+                let value = weighted.dot(other_column);
+                match (*at, *other) {
+                    (Slot::Local(a), Slot::Local(b)) => {
+                        self.local[(a, b)] += value;
+                        if k < i {
+                            self.local[(b, a)] += value;
+                        }
+                    }
+                    (Slot::Global(a), Slot::Global(b)) => {
+                        self.global[(a, b)] += value;
+                        if k < i {
+                            self.global[(b, a)] += value;
+                        }
+                    }
+                    (Slot::Local(local), Slot::Global(global)) | (Slot::Global(global), Slot::Local(local)) => {
+                        self.coupling[(local, global)] += value;
+                    }
+                }
+            }
+            let Some(error) = row.error else { continue };
+            for (k, value) in weighted.iter().enumerate() {
+                match *at {
+                    Slot::Local(local) => self.coupling[(local, error + k)] -= value,
+                    Slot::Global(global) => {
+                        self.global[(global, error + k)] -= value;
+                        self.global[(error + k, global)] -= value;
+                    }
+                }
+            }
+        }
+        if let Some(error) = row.error {
+            let mut gradient = self.global_gradient.fixed_rows_mut::<6>(error);
+            gradient -= pull;
+            let mut own = self.global.fixed_view_mut::<6, 6>(error, error);
+            own += row.information;
+        }
+    }
 }
 
 fn accumulate<const R: usize>(

@@ -45,10 +45,11 @@ impl PoseMeasurement {
         predicted: &Pose,
     ) -> (Vector6<f64>, Matrix6<f64>) {
         if self.rotation_is_measured() {
-            let miss = Pose::from_translation(-center)
-                * self.displacement.inverse()
-                * *predicted
-                * Pose::from_translation(*center);
+            let inverse = self.displacement.rotation.transpose();
+            let miss = Pose {
+                rotation: inverse * predicted.rotation,
+                translation: inverse * (predicted.transform_point(center) - self.displacement.translation) - center,
+            };
             return (miss.log(), *information);
         }
         let linear = predicted.rotation.transpose() * (predicted.transform_point(center) - self.point(center));

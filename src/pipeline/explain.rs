@@ -6,6 +6,7 @@
 //! explained becomes a possible parent for the others.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 use nalgebra::{Matrix6, Vector3, Vector6};
 use rayon::prelude::*;
@@ -62,8 +63,8 @@ pub const FEWEST_POINTS: usize = 25;
 pub struct Frame {
     /// Seconds since time zero.
     pub time_s: f64,
-    /// Each part's points.
-    pub scans: BTreeMap<Label, Vec<ScanPoint>>,
+    /// Each part's points, shared by all who keep the frame.
+    pub scans: Arc<BTreeMap<Label, Vec<ScanPoint>>>,
     /// The parts whose pose a topic measures; they have no scans.
     pub poses: BTreeMap<Label, SeenPose>,
     /// Whether one of these moves.
@@ -101,6 +102,8 @@ pub struct Scene<'a> {
     pub use_tool: bool,
     /// Parts that do not rest, followed freely from frame to frame: only a start for what explains them.
     pub free: BTreeMap<Label, Vec<Pose>>,
+    /// The same parts as if they had stayed where they were.
+    pub still: BTreeMap<Label, Motion>,
 }
 
 /// One part's motion through a window.
@@ -136,6 +139,8 @@ struct Offers {
     along: BTreeMap<Label, Option<Motion>>,
     /// Along new joints, by part and parent.
     refined: BTreeMap<(Label, Option<Label>), Vec<Motion>>,
+    /// Carried along, by part and what carries it.
+    carried: BTreeMap<(Label, Label), Motion>,
 }
 
 /// The motions of all parts with a model but the root, and the contacts by the parts that they explain.
@@ -164,7 +169,7 @@ pub fn explain_contacts(
         let Some((_, other)) = other.filter(|_| rests && own > 2.0 * TOOL_EXPLAINED) else { continue };
         let mut relabelled = contacts.clone();
         relabelled[index].label = other;
-        let moved = explain_window(&Scene { contacts: &relabelled, free: BTreeMap::new(), ..*scene }, measured);
+        let moved = explain_window(&Scene { contacts: &relabelled, ..scene.bare() }, measured);
         let cost = |motions: &BTreeMap<Label, Motion>, contacts: &[Contact]| {
             let missed = contacts.iter().filter_map(|c| Some((c, motions.get(&c.label)?)));
             let missed: f64 = missed.map(|(c, m)| miss_cost(miss_of(c, &m.displacements))).sum();
@@ -175,7 +180,7 @@ pub fn explain_contacts(
             (motions, contacts) = (moved, relabelled);
         }
     }
-    let scene = Scene { contacts: &contacts, free: BTreeMap::new(), ..*scene };
+    let scene = Scene { contacts: &contacts, ..scene.bare() };
     for (label, motion) in motions.iter_mut().filter(|(label, _)| !measured.contains_key(label)) {
         motion.explained = scene.explains(*label, motion);
     }
@@ -200,6 +205,7 @@ fn miss_cost(miss: f64) -> f64 {
 fn explain_window(scene: &Scene<'_>, measured: &BTreeMap<Label, Motion>) -> BTreeMap<Label, Motion> {
     let mut motions = measured.clone();
     let mut open: Vec<Label> = Vec::new();
+    let mut at_rest = BTreeMap::new();
     let unknown: Vec<Label> = scene.models.keys().copied().filter(|l| !motions.contains_key(l)).collect();
     for label in unknown.into_iter().filter(|&label| Some(label) != scene.root) {
         let still = scene.evaluate(label, |_| scene.start_of(label));
@@ -207,9 +213,11 @@ fn explain_window(scene: &Scene<'_>, measured: &BTreeMap<Label, Motion>) -> BTre
             motions.insert(label, still);
         } else {
             open.push(label);
+            at_rest.insert(label, still);
         }
     }
-    let scene = &Scene { free: open.par_iter().map(|&label| (label, scene.free_track(label))).collect(), ..*scene };
+    let free = open.par_iter().map(|&label| (label, scene.free_track(label))).collect();
+    let scene = &Scene { free, still: at_rest, ..scene.bare() };
     let mut offers = Offers::default();
     let mut order = Vec::new();
     while !open.is_empty() {
@@ -225,7 +233,7 @@ fn explain_window(scene: &Scene<'_>, measured: &BTreeMap<Label, Motion>) -> BTre
         order.push(label);
     }
     for label in open {
-        motions.insert(label, scene.evaluate(label, |_| scene.start_of(label)));
+        motions.insert(label, scene.still(label));
     }
     // What was explained first did not know of what came after it.
     for label in order {
@@ -247,7 +255,33 @@ fn depends(motions: &BTreeMap<Label, Motion>, label: Label, on: Label) -> bool {
     true
 }
 
-impl Scene<'_> {
+impl<'a> Scene<'a> {
+    /// The same with nothing found out yet.
+    fn bare(&self) -> Scene<'a> {
+        Scene { free: BTreeMap::new(), still: BTreeMap::new(), ..*self }
+    }
+
+    /// A part as if it had stayed where it was.
+    fn still(&self, label: Label) -> Motion {
+        self.still.get(&label).cloned().unwrap_or_else(|| self.evaluate(label, |_| self.start_of(label)))
+    }
+
+    /// A part that keeps its place on another from the start on.
+    fn carried(&self, label: Label, carrier: Label, track: &[Pose]) -> Motion {
+        let fixed = track[0].inverse() * self.start_of(label);
+        Motion { carrier: Some(carrier), ..self.evaluate(label, |k| track[k] * fixed) }
+    }
+
+    /// What may carry a part: what moves and does not depend on it.
+    fn carriers<'m>(
+        &self,
+        label: Label,
+        known: &'m BTreeMap<Label, Motion>,
+    ) -> impl Iterator<Item = (Label, &'m Motion)> {
+        let others = known.iter().map(|(other, motion)| (*other, motion));
+        others.filter(move |(other, motion)| *other != label && motion.moved && !depends(known, *other, label))
+    }
+
     /// Whether a part cannot have stayed where it was: what comes into view as others move is no sign.
     pub fn has_left(&self, label: Label) -> bool {
         if !self.models.contains_key(&label) {
@@ -276,7 +310,7 @@ impl Scene<'_> {
         let model = &self.models[&label];
         let baseline = self.baselines.get(&label).copied().unwrap_or_default();
         let costs: Vec<f64> = displacements
-            .iter()
+            .par_iter()
             .enumerate()
             .filter(|(k, _)| !self.scan(label, *k).is_empty())
             .map(|(k, d)| {
@@ -383,15 +417,14 @@ impl Scene<'_> {
             known_joint = self.touched_before.contains(&label);
             best.offer(self.score(label, motion, 0.0), motion.clone());
         }
-        for (&carrier, parent) in known.iter().filter(|(l, m)| **l != label && m.moved && !depends(known, **l, label)) {
-            let track = &parent.displacements;
-            let fixed = track[0].inverse() * self.start_of(label);
-            let motion = self.evaluate(label, |k| track[k] * fixed);
-            best.offer(self.score(label, &motion, 0.0), Motion { carrier: Some(carrier), ..motion });
+        for (carrier, parent) in self.carriers(label, known) {
+            let found = offers.carried.get(&(label, carrier)).cloned();
+            let motion = found.unwrap_or_else(|| self.carried(label, carrier, &parent.displacements));
+            best.offer(self.score(label, &motion, 0.0), motion);
         }
         let settled = best.motion.as_ref().is_some_and(|motion| {
             let held = self.tool_miss(label, &motion.displacements) < 1.5 * TOOL_EXPLAINED;
-            let still = self.evaluate(label, |_| self.start_of(label));
+            let still = self.still(label);
             held && (known_joint || motion.excess < EXPLAINED || motion.excess < 0.3 * still.excess)
         });
         (best.motion, settled)
@@ -419,6 +452,15 @@ impl Scene<'_> {
             })
             .collect();
         offers.along.extend(along);
+        let carriers = labels.iter().flat_map(|&label| self.carriers(label, known).map(move |c| (label, c)));
+        let missing: Vec<_> = carriers.filter(|(label, (c, _))| !offers.carried.contains_key(&(*label, *c))).collect();
+        let carried: Vec<_> = missing
+            .par_iter()
+            .map(|&(label, (carrier, motion))| {
+                ((label, carrier), self.carried(label, carrier, &motion.displacements))
+            })
+            .collect();
+        offers.carried.extend(carried);
         let mut pairs: Vec<(Label, Option<Label>, usize)> = Vec::new();
         for &label in labels {
             let (best, settled) = self.simple_motion(label, known, offers);
@@ -448,7 +490,7 @@ impl Scene<'_> {
         if settled {
             return simple;
         }
-        let still = self.evaluate(label, |_| self.start_of(label));
+        let still = self.still(label);
         let carried = simple.as_ref().map_or(still.excess, |m| m.excess.min(still.excess));
         // A part that nothing touches needs a better reason for a joint of its own: what it shows anew
         // must not pass for motion.
@@ -467,7 +509,7 @@ impl Scene<'_> {
 
     /// A motion, or rest if it does not explain clearly more, or the free track if nothing else does.
     fn accepted(&self, label: Label, motion: Motion) -> Motion {
-        let still = self.evaluate(label, |_| self.start_of(label));
+        let still = self.still(label);
         tracing::trace!(%label, excess = motion.excess, score = motion.score, seed = ?motion.seed, still = still.excess, still_miss = self.tool_miss(label, &still.displacements), free = self.free.get(&label).map(|t| self.evaluate(label, |k| t[k]).excess), "accept");
         let motion = if self.beats(label, &motion, &still) { motion } else { still };
         if motion.excess > UNEXPLAINED
@@ -492,6 +534,7 @@ impl Scene<'_> {
             let motion = self.accepted(label, motion);
             motions.insert(label, motion);
             offers.refined.retain(|(_, parent), _| *parent != Some(label));
+            offers.carried.retain(|(_, carrier), _| *carrier != label);
         }
     }
 

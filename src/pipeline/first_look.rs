@@ -38,7 +38,7 @@ impl FirstLook {
         let mut accumulators: BTreeMap<Label, SurfelAccumulator> = BTreeMap::new();
         let every = self.frames.len().div_ceil(REFERENCE_FRAMES).max(1);
         for frame in self.frames.iter().step_by(every) {
-            for (label, scan) in &frame.scans {
+            for (label, scan) in frame.scans.iter() {
                 accumulators.entry(*label).or_default().add(scan, &Pose::identity());
             }
         }

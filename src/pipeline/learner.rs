@@ -16,7 +16,7 @@ use crate::inference::SamplingSettings;
 use crate::math::{Pose, log_sum_exp};
 use crate::mechanism::JointType;
 use crate::model::{
-    Axis, Contact, EdgeFit, EdgePart, KinematicFit, KinematicJoint, KinematicSettings, PoseMeasurement,
+    Axis, Contact, EdgeFit, EdgePart, KinematicFit, KinematicJoint, KinematicSettings, PoseMeasurement, SharedByFits,
     WindowObservations, axes_from_motion, fit_kinematics, moving_evidence, relative_windows, rigid_evidence,
 };
 use crate::model::{DynamicsInput, DynamicsLearner, DynamicsPosterior, WindowInference};
@@ -158,6 +158,9 @@ pub struct Learner {
     /// Where each part was when each window's scans were measured last.
     #[serde(skip)]
     pub(super) measured_at: BTreeMap<Label, Vec<Vec<Pose>>>,
+    /// Normals of the faces of each part's first look, once they were asked for.
+    #[serde(skip)]
+    face_normals: BTreeMap<Label, Vec<Vector3<f64>>>,
     /// Where each model has its keyframes.
     #[serde(skip)]
     built_at: BTreeMap<Label, Vec<Option<Pose>>>,
@@ -220,6 +223,7 @@ impl Learner {
             kept_windows: usize::MAX,
             kept: Vec::new(),
             measured_at: BTreeMap::new(),
+            face_normals: BTreeMap::new(),
             built_at: BTreeMap::new(),
             gaps,
             baselines: BTreeMap::new(),
@@ -360,6 +364,7 @@ impl Learner {
             root: Some(self.root),
             use_tool: self.use_tool,
             free: BTreeMap::new(),
+            still: BTreeMap::new(),
         }
     }
 
@@ -495,18 +500,16 @@ impl Learner {
         let Some(track) = self.tracks.get(&label).and_then(|t| t.get(window)) else { return };
         let rests = track.windows(2).all(|pair| pair[0] == pair[1]);
         let every = if rests { frames.len().div_ceil(RESTING_FRAMES).max(1) } else { 1 };
-        let faces: Vec<_> = frames
-            .iter()
-            .zip(track)
-            .enumerate()
-            .map(|(k, (frame, displacement))| match (self.models.get(&label), frame.scans.get(&label)) {
+        let one = |(k, (frame, displacement)): (usize, (&Frame, &Pose))| {
+            match (self.models.get(&label), frame.scans.get(&label)) {
                 (Some(model), Some(scan)) if k % every == 0 => {
                     let past = rays_past(frame, label, model, displacement);
                     measure_faces(model, scan, &past, displacement, &settings)
                 }
                 _ => [None; 2],
-            })
-            .collect();
+            }
+        };
+        let faces: Vec<_> = frames.par_iter().zip(track).enumerate().map(one).collect();
         let measured_at = self.measured_at.entry(label).or_default();
         measured_at.resize(measured_at.len().max(window + 1), Vec::new());
         measured_at[window].clone_from(track);
@@ -620,7 +623,8 @@ impl Learner {
         let carrier = carrier.as_ref().map(|part| (part, self.tracks[&part.label].as_slice()));
         let relative = relative_windows(&part, &self.tracks[&child], carrier, &windows);
         let resting = self.resting_windows(child, parent);
-        let (rigid, rigid_by_window) = rigid_evidence(&part, &relative, &self.settings);
+        let shared = SharedByFits::default();
+        let (rigid, rigid_by_window) = rigid_evidence(&part, &relative, &self.settings, &shared);
         let past = self.past_evidence(child, parent);
         let log_evidence = past.map(|past| past + rigid);
         let mut option = ParentEvidence { parent, log_evidence, fits: [None, None, None], rigid_by_window, past };
@@ -629,7 +633,7 @@ impl Learner {
             if self.is_hopeless(child, parent, joint_type) {
                 starts.truncate(1);
             }
-            let fit = moving_evidence(&part, joint_type, &starts, &relative, &resting, &self.settings);
+            let fit = moving_evidence(&part, joint_type, &starts, (&relative, &resting), &self.settings, &shared);
             let slot = joint_type as usize;
             if let Some(mut fit) = fit {
                 self.keep_sign(&mut fit, child, parent);
@@ -804,6 +808,11 @@ impl Learner {
     /// Fits all joints of the likeliest tree to all windows.
     fn fit_joints(&mut self) {
         let tree = self.likeliest();
+        for label in tree.iter().map(|(child, ..)| *child).chain([self.root]) {
+            if let (None, Some(model)) = (self.face_normals.get(&label), self.models.get(&label)) {
+                self.face_normals.insert(label, model.face_normals());
+            }
+        }
         let index = |label: Label| tree.iter().position(|(l, ..)| *l == label);
         // An edge is fitted anew after every window and may find its axis the other way round; what
         // was learned of a joint counts along the direction that it had.
@@ -874,7 +883,7 @@ impl Learner {
         let labels = [Some(child), parent, Some(self.root)];
         let mut candidates = Vec::new();
         for label in labels.into_iter().flatten() {
-            let normals = self.models.get(&label).map(PartModel::face_normals).unwrap_or_default();
+            let normals = self.face_normals.get(&label).map_or(&[][..], Vec::as_slice);
             for (i, first) in normals.iter().enumerate() {
                 candidates.push(*first);
                 candidates.extend(normals[..i].iter().filter_map(|second| {

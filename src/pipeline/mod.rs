@@ -285,7 +285,9 @@ impl Pipeline {
             outputs.extend(self.end_record());
         }
         self.last_frame_s = Some(frame.time_s);
-        frame.scans.retain(|label, _| !self.poses.measures(*label));
+        if frame.scans.keys().any(|label| self.poses.measures(*label)) {
+            Arc::make_mut(&mut frame.scans).retain(|label, _| !self.poses.measures(*label));
+        }
         frame.poses = self.poses.at(stamp);
         frame.moves = self.poses.something_moves(frame.time_s, &frame.poses);
         outputs.extend(self.take_up(&frame, zero));
@@ -450,7 +452,7 @@ impl Pipeline {
             return outputs;
         };
         let settings = AlignmentSettings::default();
-        for (label, scan) in &frame.scans {
+        for (label, scan) in frame.scans.iter() {
             let last = self.current.get(label).copied().unwrap_or_else(Pose::identity);
             let mut measurement = PoseMeasurement { displacement: last, information: Matrix6::zeros() };
             if *label != learner.root

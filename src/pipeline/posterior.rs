@@ -45,7 +45,7 @@ impl Pipeline {
         if let Some(learner) = &self.learner {
             return learner.surfaces();
         }
-        let last = self.frames_at_rest().last().into_iter().flat_map(|frame| &frame.scans);
+        let last = self.frames_at_rest().last().into_iter().flat_map(|frame| frame.scans.iter());
         last.map(|(label, scan)| (*label, scan.iter().map(|p| p.point_in_world).collect())).collect()
     }
 }

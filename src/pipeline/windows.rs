@@ -82,20 +82,19 @@ impl FrameAssembler {
 
 /// One frame from the clouds of a stamp, with at most so many points of each part, evenly picked; 0: all.
 pub fn frame_of(time_s: f64, clouds: &[SegmentedCloud], most_points: usize) -> Frame {
-    let mut frame = Frame { time_s, ..Frame::default() };
+    let mut scans: BTreeMap<Label, Vec<ScanPoint>> = BTreeMap::new();
     for cloud in clouds {
         for point in &cloud.points {
-            frame
-                .scans
+            scans
                 .entry(point.label)
                 .or_default()
                 .push(ScanPoint { point_in_world: point.point_in_world, viewpoint_in_world: cloud.viewpoint_in_world });
         }
     }
-    for scan in frame.scans.values_mut().filter(|scan| most_points > 0 && scan.len() > most_points) {
+    for scan in scans.values_mut().filter(|scan| most_points > 0 && scan.len() > most_points) {
         *scan = (0..most_points).map(|k| scan[k * scan.len() / most_points]).collect();
     }
-    frame
+    Frame { time_s, scans: scans.into(), ..Frame::default() }
 }
 
 /// Readings of the wrenches, and what they read at rest.
@@ -171,9 +170,17 @@ impl WindowCutter {
         // Registration sees motion where there is none; a measured pose does not.
         let opens = active || frame.moves;
         let moving = moving || frame.moves;
-        self.frames.push_back(frame);
         match self.open_since {
-            None if opens => self.open_since = Some(now),
+            Some(_) => push_spaced(&mut self.frames, frame),
+            None => self.frames.push_back(frame),
+        }
+        match self.open_since {
+            None if opens => {
+                self.open_since = Some(now);
+                let mut thinned = VecDeque::new();
+                self.frames.drain(..).for_each(|frame| push_spaced(&mut thinned, frame));
+                self.frames = thinned;
+            }
             None => {
                 self.readings.track_rest(previous, now);
                 self.forget(now - self.readings.settings.lead_s - 0.2);
@@ -221,14 +228,28 @@ impl WindowCutter {
     }
 }
 
+/// Whether a frame is far enough from the last one kept.
+fn apart(before: &Frame, frame: &Frame) -> bool {
+    frame.scans.is_empty() || frame.time_s - before.time_s >= FRAME_SPACING
+}
+
+/// Adds a frame; the last one goes if [`spaced`] would not keep it, so that a window's frames do not pile up.
+fn push_spaced(frames: &mut VecDeque<Frame>, frame: Frame) {
+    if let [.., kept, last] = frames.make_contiguous()
+        && !apart(kept, last)
+    {
+        frames.pop_back();
+    }
+    frames.push_back(frame);
+}
+
 /// Frames that are [`FRAME_SPACING`] apart at least, the first and the last among them; all of those without
 /// clouds, as measured poses share no such error.
 fn spaced(frames: impl Iterator<Item = Frame>) -> Vec<Frame> {
     let mut kept: Vec<Frame> = Vec::new();
     let mut between = None;
     for frame in frames {
-        let apart = |before: &Frame| frame.scans.is_empty() || frame.time_s - before.time_s >= FRAME_SPACING;
-        if kept.last().is_none_or(apart) {
+        if kept.last().is_none_or(|before| apart(before, &frame)) {
             kept.push(frame);
             between = None;
         } else {
@@ -371,8 +392,15 @@ mod tests {
     use super::*;
 
     fn times(rate_hz: f64, count: usize, scans: &BTreeMap<Label, Vec<ScanPoint>>) -> Vec<f64> {
+        let scans = std::sync::Arc::new(scans.clone());
         let frame = |k: usize| Frame { time_s: k as f64 / rate_hz, scans: scans.clone(), ..Frame::default() };
-        spaced((0..count).map(frame)).iter().map(|frame| frame.time_s).collect()
+        let mut as_they_come = VecDeque::new();
+        (0..count).for_each(|k| push_spaced(&mut as_they_come, frame(k)));
+        assert!(scans.is_empty() || as_they_come.len() <= 2 + (count as f64 / rate_hz / FRAME_SPACING) as usize);
+        let all = spaced((0..count).map(frame));
+        let thinned = spaced(as_they_come.into_iter());
+        assert!(all.iter().map(|frame| frame.time_s).eq(thinned.iter().map(|frame| frame.time_s)));
+        all.iter().map(|frame| frame.time_s).collect()
     }
 
     #[test]

@@ -29,7 +29,7 @@ pub use self_closing::SelfClosing;
 pub use soft_close::SoftClose;
 pub use spring::Spring;
 pub use stribeck::Stribeck;
-pub use table::{AttachedTable, TableKind};
+pub use table::{AttachedTable, TableKind, TableSpan};
 
 use serde::{Deserialize, Serialize};
 

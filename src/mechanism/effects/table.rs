@@ -8,6 +8,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use super::super::parameters::JointForces;
+use super::super::rollout::Reach;
 use super::{Dimension, JointState};
 use crate::math::Real;
 
@@ -49,6 +50,34 @@ impl TableKind {
             Self::InertiaOverPosition => Dimension::Inertia,
             _ => Dimension::Force,
         }
+    }
+}
+
+/// The arguments between which an entry of a table matters.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TableSpan {
+    argument: Dimension,
+    least: f64,
+    greatest: f64,
+}
+
+impl TableSpan {
+    /// Of the entry at one of the `nodes`.
+    pub fn of_node(kind: TableKind, nodes: &[f64], node: usize) -> Self {
+        // Beyond its ends a table goes on as there.
+        let least = node.checked_sub(1).map_or(f64::NEG_INFINITY, |before| nodes[before]);
+        let greatest = nodes.get(node + 1).copied().unwrap_or(f64::INFINITY);
+        Self { argument: kind.argument(), least, greatest }
+    }
+
+    /// Whether a joint that goes so far in `span_s` comes within `margin` of it.
+    pub fn meets(&self, reach: &Reach, span_s: [f64; 2], margin: f64) -> bool {
+        let [least, greatest] = match self.argument {
+            Dimension::Position => reach.position,
+            Dimension::Rate => reach.rate,
+            _ => span_s,
+        };
+        least - margin <= self.greatest && greatest + margin >= self.least
     }
 }
 
@@ -156,6 +185,15 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn entries_matter_between_their_neighbours() {
+        let span = |node| TableSpan::of_node(TableKind::ForceOverPosition, &[0.0, 1.0, 3.0], node);
+        let meets = |node, position| span(node).meets(&Reach { position, rate: [0.0; 2] }, [0.0; 2], 0.0);
+        assert_eq!([0, 1, 2].map(|node| meets(node, [1.5, 2.0])), [false, true, true]);
+        assert_eq!([0, 1, 2].map(|node| meets(node, [-5.0, -4.0])), [true, false, false]);
+        assert_eq!([0, 1, 2].map(|node| meets(node, [0.5, 1.5])), [true; 3]);
     }
 
     #[test]

@@ -198,10 +198,16 @@ impl Problem<'_> {
     /// κ of the greatest likelihood by window, by ascent from the last.
     fn choose_scales(&self) -> Result<Vec<f64>, Failure> {
         let choose = |w: usize| {
+            let of = |innovations: &Innovations, scale: f64| {
+                -innovations.cost() - innovations.half_log_determinant - scale_cost(scale)
+            };
             let density = |at: usize| {
+                // What was fitted last was fitted with this one.
+                if let Some(latest) = self.latest.get(w).filter(|_| NOISE_SCALES[at] == self.scales[w]) {
+                    return Ok(of(latest, self.scales[w]));
+                }
                 let model = self.hypothesis.window(self.windows[w], NOISE_SCALES[at]);
-                let innovations = model.linearize(&self.x, &[])?;
-                Ok::<_, Failure>(-innovations.cost() - innovations.half_log_determinant - scale_cost(NOISE_SCALES[at]))
+                Ok::<_, Failure>(of(&model.linearize(&self.x, &[])?, NOISE_SCALES[at]))
             };
             let mut at = NOISE_SCALES.iter().position(|s| *s >= self.scales[w]).unwrap_or(0);
             let mut best = density(at)?;

@@ -15,11 +15,15 @@ use nalgebra::{DMatrix, DVector, Vector3};
 use num_dual::DualSVec64;
 use rayon::prelude::*;
 
-use super::layout::{Mechanism, SensorError};
+use super::layout::{AddedTable, Mechanism, SensorError};
 use super::track::{CONTACT_DEVIATION, Drive, JointTrack, Observation};
 use crate::inference::Failure;
 use crate::math::Real;
-use crate::mechanism::{Spatial, State, Tree, Workspace, WrenchPoint, WrenchSample, WrenchTrack, rollout_in};
+use crate::mechanism::effects::TableSpan;
+use crate::mechanism::{
+    Reach, SingleJoint, Spatial, State, Tree, Workspace, WrenchPoint, WrenchSample, WrenchTrack, advance_single,
+    rollout_in,
+};
 use crate::model::Axis;
 
 /// Longest step of the simulation \[s\]: half a wrench sample; trajectories of the midpoint step
@@ -87,6 +91,15 @@ struct Advance {
     derivatives: DMatrix<f64>,
 }
 
+/// A span under way, chunk by chunk.
+struct Passage {
+    span: [f64; 2],
+    /// How many parameters there are.
+    p: usize,
+    after: DVector<f64>,
+    derivatives: DMatrix<f64>,
+}
+
 /// One observation, and the way to it.
 struct Passed {
     advance: Option<Advance>,
@@ -114,30 +127,45 @@ impl Innovations {
     }
 }
 
-/// Directions that one simulation of a single joint carries derivatives along.
+/// Directions that one simulation of a single joint carries derivatives along, at most.
 const CHUNK: usize = 8;
 /// Step of finite differences where several joints move. Dual numbers through a chain of three cost
 /// 60 ms a window in copies, one more simulation .3 ms; away from switches the two agree to 1e-5.
 const DIFFERENCE: f64 = 1e-6;
+/// A position or rate this near an interval of a table may lie in it \[m or rad, m/s or rad/s\].
+const TABLE_MARGIN: f64 = 1e-9;
 
 /// What a simulation needs of the parameters.
 #[derive(Clone)]
 pub(super) struct Plant<T: Real> {
     pub(super) tree: Tree<T>,
+    /// The only joint that moves, if one does.
+    single: Option<SingleJoint<T>>,
     sensor: SensorError<T>,
     /// Lent to one simulation at a time.
     workspace: RefCell<Workspace<T>>,
 }
 
 /// A plant with derivatives along some of the directions: first parameters, then q, then q̇.
-struct Chunk {
-    plant: Plant<DualSVec64<CHUNK>>,
+struct Chunk<const N: usize> {
+    plant: Plant<DualSVec64<N>>,
     first: usize,
+    /// Where its parameters matter, if all are entries of tables.
+    spans: Option<Vec<TableSpan>>,
+}
+
+/// Plants of a single joint that together cover all directions.
+struct Forward {
+    /// Without derivatives, to see where the joint goes.
+    plain: Plant<f64>,
+    eights: Vec<Chunk<8>>,
+    four: Option<Chunk<4>>,
+    two: Option<Chunk<2>>,
 }
 
 /// How the derivatives of a span are taken.
 enum Slopes {
-    Forward(Vec<Chunk>),
+    Forward(Box<Forward>),
     /// The plant, and one for each parameter moved by [`DIFFERENCE`].
     Differences(Box<Plant<f64>>, Vec<Plant<f64>>),
 }
@@ -188,13 +216,8 @@ impl WindowModel<'_> {
             state += &gain * innovation;
             passed.push(Passed { advance, rows, gain: Gain { gain, deviation } });
         }
-        let columns: Vec<Vec<f64>> = match slopes {
-            Slopes::Forward(_) => {
-                let column = |i: usize| {
-                    self.innovation_slopes(&passed, |advance| Ok(advance.derivatives.column(i).into_owned()))
-                };
-                (0..p).map(column).collect::<Result<_, _>>()?
-            }
+        match slopes {
+            Slopes::Forward(_) => self.forward_slopes(&passed, p, &mut result.slopes)?,
             Slopes::Differences(_, moved) => {
                 let column = |plant: Plant<f64>| {
                     self.innovation_slopes(&passed, |advance| {
@@ -203,10 +226,11 @@ impl WindowModel<'_> {
                     })
                 };
                 // In the order of `active`, so threads do not show in the result.
-                moved.into_par_iter().map(column).collect::<Result<_, _>>()?
+                let columns: Vec<Vec<f64>> = moved.into_par_iter().map(column).collect::<Result<_, _>>()?;
+                result.slopes =
+                    (0..result.whitened.len()).flat_map(|row| columns.iter().map(move |c| c[row])).collect();
             }
-        };
-        result.slopes = (0..result.whitened.len()).flat_map(|row| columns.iter().map(move |c| c[row])).collect();
+        }
         result.gains = passed.into_iter().map(|passed| passed.gain).collect();
         if result.whitened.iter().chain(&result.slopes).all(|e| e.is_finite()) {
             Ok(result)
@@ -236,6 +260,25 @@ impl WindowModel<'_> {
             all.extend(deviation.solve_lower_triangular(&innovation).ok_or(Failure::Diverged)?.iter());
         }
         Ok(all)
+    }
+
+    /// The same by all `p` parameters at once, row by row, where their derivatives came with the simulation.
+    fn forward_slopes(&self, passed: &[Passed], p: usize, all: &mut Vec<f64>) -> Result<(), Failure> {
+        let n = self.moving.len();
+        let mut slope = DMatrix::zeros(2 * n + CONTACT, p);
+        all.reserve(n * p * passed.len());
+        for Passed { advance, rows, gain: Gain { gain, deviation } } in passed {
+            if let Some(advance) = advance {
+                slope = &advance.transition * slope;
+                let mut own = slope.rows_mut(0, 2 * n);
+                own += advance.derivatives.columns(0, p);
+            }
+            let innovation = -(rows * &slope);
+            slope += gain * &innovation;
+            let whitened = deviation.solve_lower_triangular(&innovation).ok_or(Failure::Diverged)?;
+            all.extend(whitened.row_iter().flat_map(|row| row.iter().copied().collect::<Vec<f64>>()));
+        }
+        Ok(())
     }
 
     /// The filter alone, step by step.
@@ -314,21 +357,47 @@ impl WindowModel<'_> {
     pub(super) fn plant<T: Real>(&self, x: &[T]) -> Result<Plant<T>, Failure> {
         let tree = self.mechanism.tree(x, self.axes, self.frozen)?;
         let workspace = RefCell::new(Workspace::new(&tree));
-        Ok(Plant { tree, sensor: self.mechanism.sensor_error(x), workspace })
+        let single = SingleJoint::of(&tree);
+        Ok(Plant { tree, single, sensor: self.mechanism.sensor_error(x), workspace })
     }
 
     fn forward(&self, x: &[f64], active: &[usize]) -> Result<Slopes, Failure> {
         let directions = active.len() + 2 * self.moving.len();
-        let chunks = (0..directions).step_by(CHUNK).map(|first| {
-            let mut parameters: Vec<DualSVec64<CHUNK>> = x.iter().map(|&v| Real::constant(v)).collect();
-            for (i, &at) in active.iter().enumerate() {
-                if (first..first + CHUNK).contains(&i) {
-                    parameters[at] = parameters[at].derivative(i - first);
-                }
-            }
-            Ok(Chunk { plant: self.plant(&parameters)?, first })
-        });
-        Ok(Slopes::Forward(chunks.collect::<Result<_, Failure>>()?))
+        let rest = directions % CHUNK;
+        let whole = if rest > 4 { directions.div_ceil(CHUNK) } else { directions / CHUNK };
+        let first = whole * CHUNK;
+        let eights = (0..whole).map(|k| self.chunk::<8>(x, active, k * CHUNK));
+        Ok(Slopes::Forward(Box::new(Forward {
+            plain: self.plant(x)?,
+            eights: eights.collect::<Result<_, Failure>>()?,
+            four: (rest == 3 || rest == 4).then(|| self.chunk(x, active, first)).transpose()?,
+            two: (rest == 1 || rest == 2).then(|| self.chunk(x, active, first)).transpose()?,
+        })))
+    }
+
+    /// The plant with derivatives along the directions from the `first` on.
+    fn chunk<const N: usize>(&self, x: &[f64], active: &[usize], first: usize) -> Result<Chunk<N>, Failure> {
+        let mut parameters: Vec<DualSVec64<N>> = x.iter().map(|&v| Real::constant(v)).collect();
+        let own = active.iter().enumerate().skip(first).take(N);
+        for (i, &at) in own.clone() {
+            parameters[at] = parameters[at].derivative(i - first);
+        }
+        let parameters_only = first + N <= active.len();
+        let spans: Option<Vec<TableSpan>> = own.map(|(_, &at)| self.table_span(at)).collect();
+        Ok(Chunk { plant: self.plant(&parameters)?, first, spans: spans.filter(|_| parameters_only) })
+    }
+
+    /// Where a number matters that is an entry of a table of a joint that moves.
+    fn table_span(&self, at: usize) -> Option<TableSpan> {
+        self.moving.iter().find_map(|&joint| {
+            let model = &self.mechanism.joints[joint];
+            let own = at.checked_sub(self.mechanism.offset(joint))?;
+            (0..model.tables.len()).find_map(|table| {
+                let node = own.checked_sub(model.table_offset(table))?;
+                let AddedTable { kind, nodes, .. } = &model.tables[table];
+                (node < nodes.len()).then(|| TableSpan::of_node(*kind, nodes, node))
+            })
+        })
     }
 
     fn differences(&self, x: &[f64], active: &[usize]) -> Result<Slopes, Failure> {
@@ -350,8 +419,8 @@ impl WindowModel<'_> {
         span: [f64; 2],
         p: usize,
     ) -> Result<(DVector<f64>, DMatrix<f64>), Failure> {
-        let chunks = match slopes {
-            Slopes::Forward(chunks) => chunks,
+        let forward = match slopes {
+            Slopes::Forward(forward) => forward,
             Slopes::Differences(plant, _) => {
                 let after = DVector::from_vec(self.advance(plant, state.as_slice(), span)?);
                 let mut derivatives = DMatrix::zeros(state.len(), state.len());
@@ -365,32 +434,74 @@ impl WindowModel<'_> {
             }
         };
         let size = state.len();
-        let mut after = DVector::zeros(size);
-        let mut derivatives = DMatrix::zeros(size, p + size);
-        for chunk in chunks {
-            let start: Vec<DualSVec64<CHUNK>> = (0..size)
-                .map(|i| {
-                    let value: DualSVec64<CHUNK> = Real::constant(state[i]);
-                    match (p + i).checked_sub(chunk.first) {
-                        Some(direction) if direction < CHUNK => value.derivative(direction),
-                        _ => value,
-                    }
-                })
-                .collect();
-            for (i, value) in self.advance(&chunk.plant, &start, span)?.iter().enumerate() {
-                after[i] = value.re;
-                if let Some(eps) = &value.eps.0 {
-                    for direction in 0..CHUNK.min(p + size - chunk.first) {
-                        derivatives[(i, chunk.first + direction)] = eps[direction];
-                    }
+        let mut passage = Passage { span, p, after: DVector::zeros(size), derivatives: DMatrix::zeros(size, p + size) };
+        let mut reach = None;
+        for chunk in &forward.eights {
+            if let Some(spans) = &chunk.spans {
+                let reach = match reach {
+                    Some(reach) => reach,
+                    None => *reach.insert(self.reach(&forward.plain, state.as_slice(), span)?),
+                };
+                // Entries of tables that the joint does not come to change nothing.
+                if !spans.iter().any(|own| own.meets(&reach, span, TABLE_MARGIN)) {
+                    continue;
+                }
+            }
+            self.pass(chunk, state, &mut passage)?;
+        }
+        forward.four.iter().try_for_each(|chunk| self.pass(chunk, state, &mut passage))?;
+        forward.two.iter().try_for_each(|chunk| self.pass(chunk, state, &mut passage))?;
+        Ok((passage.after, passage.derivatives))
+    }
+
+    /// Carries a chunk's derivatives through a span.
+    fn pass<const N: usize>(
+        &self,
+        chunk: &Chunk<N>,
+        state: &DVector<f64>,
+        passage: &mut Passage,
+    ) -> Result<(), Failure> {
+        let (size, p) = (state.len(), passage.p);
+        let start: Vec<DualSVec64<N>> = (0..size)
+            .map(|i| {
+                let value: DualSVec64<N> = Real::constant(state[i]);
+                match (p + i).checked_sub(chunk.first) {
+                    Some(direction) if direction < N => value.derivative(direction),
+                    _ => value,
+                }
+            })
+            .collect();
+        for (i, value) in self.advance(&chunk.plant, &start, passage.span)?.iter().enumerate() {
+            passage.after[i] = value.re;
+            if let Some(eps) = &value.eps.0 {
+                for direction in 0..N.min(p + size - chunk.first) {
+                    passage.derivatives[(i, chunk.first + direction)] = eps[direction];
                 }
             }
         }
-        Ok((after, derivatives))
+        Ok(())
+    }
+
+    /// Where a single joint goes in a span.
+    fn reach(&self, plant: &Plant<f64>, state: &[f64], span: [f64; 2]) -> Result<Reach, Failure> {
+        let mut reach = Reach::default();
+        self.advance_noting(plant, state, span, Some(&mut reach))?;
+        Ok(reach)
     }
 
     /// (q, q̇) of the moving joints after a span.
     pub(super) fn advance<T: Real>(&self, plant: &Plant<T>, state: &[T], span: [f64; 2]) -> Result<Vec<T>, Failure> {
+        self.advance_noting(plant, state, span, None)
+    }
+
+    /// The same; `reach` takes in where a single joint goes.
+    fn advance_noting<T: Real>(
+        &self,
+        plant: &Plant<T>,
+        state: &[T],
+        span: [f64; 2],
+        mut reach: Option<&mut Reach>,
+    ) -> Result<Vec<T>, Failure> {
         // The sensor's errors act while the tool does, so a span in which contact begins or ends is cut.
         let delay_s = plant.sensor.delay_s.value();
         let ends = |drive: &Drive| {
@@ -401,26 +512,21 @@ impl WindowModel<'_> {
         let contacts: Vec<Option<[f64; 2]>> = self.track.drives.iter().map(ends).collect();
         let within = |t: &f64| *t > span[0] + 1e-6 && *t < span[1] - 1e-6;
         if let Some(cut) = contacts.iter().flatten().flatten().copied().find(|t| within(t)) {
-            let middle = self.advance_evenly(plant, state, [span[0], cut], &contacts)?;
-            return self.advance_evenly(plant, &middle, [cut, span[1]], &contacts);
+            let middle = self.advance_evenly(plant, state, [span[0], cut], &contacts, reach.as_deref_mut())?;
+            return self.advance_evenly(plant, &middle, [cut, span[1]], &contacts, reach);
         }
-        self.advance_evenly(plant, state, span, &contacts)
+        self.advance_evenly(plant, state, span, &contacts, reach)
     }
 
     fn advance_evenly<T: Real>(
         &self,
-        Plant { tree, sensor, workspace }: &Plant<T>,
+        Plant { tree, single, sensor, workspace }: &Plant<T>,
         state: &[T],
         span: [f64; 2],
         contacts: &[Option<[f64; 2]>],
+        reach: Option<&mut Reach>,
     ) -> Result<Vec<T>, Failure> {
         let n = self.moving.len();
-        let mut positions = vec![T::zero(); self.mechanism.joints.len()];
-        let mut rates = positions.clone();
-        for (i, &joint) in self.moving.iter().enumerate() {
-            positions[joint] = state[i];
-            rates[joint] = state[n + i];
-        }
         let middle_s = 0.5 * (span[0] + span[1]);
         let delay_s = sensor.delay_s.value();
         let drives = self.track.drives.iter().zip(contacts);
@@ -441,6 +547,19 @@ impl WindowModel<'_> {
                 }
             })
             .collect();
+        if let Some(single) = single
+            && *self.moving == [single.body]
+        {
+            let start = (state[0], state[1]);
+            let end = advance_single((tree, single), start, &tracks, span, STEP_S, reach);
+            return end.map(|(position, rate)| vec![position, rate]).map_err(|_| Failure::Diverged);
+        }
+        let mut positions = vec![T::zero(); self.mechanism.joints.len()];
+        let mut rates = positions.clone();
+        for (i, &joint) in self.moving.iter().enumerate() {
+            positions[joint] = state[i];
+            rates[joint] = state[n + i];
+        }
         let step_s = if n > 1 { CHAIN_STEP_S } else { STEP_S };
         let start = State::new(positions, rates);
         let run = rollout_in(&mut workspace.borrow_mut(), tree, &start, &tracks, &span, step_s)
@@ -507,6 +626,7 @@ fn within(samples: &[WrenchSample], span: [f64; 2]) -> &[WrenchSample] {
 /// White generalized force: what the wrench sensor's noise and the unevenness of friction do.
 struct ProcessNoise {
     tree: Tree<f64>,
+    workspace: RefCell<Workspace<f64>>,
     /// Density of the friction's unevenness per moving joint \[N² s or (N·m)² s\].
     floor: Vec<f64>,
 }
@@ -514,6 +634,7 @@ struct ProcessNoise {
 impl ProcessNoise {
     fn new(model: &WindowModel<'_>, x: &[f64]) -> Result<Self, Failure> {
         let tree = model.mechanism.tree(x, model.axes, model.frozen)?;
+        let workspace = RefCell::new(Workspace::new(&tree));
         let floor = model
             .moving
             .iter()
@@ -522,14 +643,14 @@ impl ProcessNoise {
                 (FRICTION_SHARE * friction).powi(2) * FRICTION_SPAN_S
             })
             .collect();
-        Ok(Self { tree, floor })
+        Ok(Self { tree, workspace, floor })
     }
 
     /// Covariance that (q, q̇) gather over a span.
     fn over(&self, span: [f64; 2], q: &[f64], model: &WindowModel<'_>) -> Result<DMatrix<f64>, Failure> {
         let n = model.moving.len();
         let mut density = DMatrix::from_fn(n, n, |i, j| if i == j { self.floor[i] } else { 0.0 });
-        let screws = self.tree.screws(q);
+        let (screws, mass) = self.tree.screws_and_mass_matrix(q, &mut self.workspace.borrow_mut());
         for drive in &model.track.drives {
             let Some(sample) = within(&drive.samples, span).first() else { continue };
             let mut levers = vec![[nalgebra::Vector3::zeros(); 2]; n];
@@ -550,7 +671,6 @@ impl ProcessNoise {
                 }
             }
         }
-        let mass = self.tree.mass_matrix(q);
         let mass = DMatrix::from_fn(n, n, |i, j| mass[(model.moving[i], model.moving[j])]);
         let inverse = mass.cholesky().ok_or(Failure::Diverged)?.inverse();
         let density = &inverse * density * inverse * model.noise_scale;

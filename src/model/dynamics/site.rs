@@ -143,7 +143,7 @@ impl WindowFit<'_> {
             let solution = solve(&mut problem, prior, &point, &settings)?;
             spent += solution.steps;
             if round + 1 < rounds {
-                let (best, tried) = self.best_noise_scale(&solution.point, scale)?;
+                let (best, tried) = self.best_noise_scale(&solution.point, scale, &problem.latest)?;
                 spent += tried;
                 if best != scale {
                     scale = best;
@@ -165,17 +165,26 @@ impl WindowFit<'_> {
     }
 
     /// κ of the greatest likelihood at given parameters, by ascent over the grid; how many
-    /// linearizations that took.
-    fn best_noise_scale(&self, point: &DVector<f64>, from: f64) -> Result<(f64, usize), Failure> {
+    /// linearizations that took. `latest` are the innovations there with κ = `from`.
+    fn best_noise_scale(
+        &self,
+        point: &DVector<f64>,
+        from: f64,
+        latest: &Innovations,
+    ) -> Result<(f64, usize), Failure> {
         let mut x = self.base.clone();
         for (&at, value) in self.active.iter().zip(point.iter()) {
             x[at] = *value;
         }
         let mut tried = 0;
+        let of =
+            |innovations: &Innovations, scale| -innovations.cost() - innovations.half_log_determinant - scale_cost(scale);
         let mut density = |scale: f64| {
+            if scale == from {
+                return Ok(of(latest, scale));
+            }
             tried += 1;
-            let innovations = self.model(scale).linearize(&x, &[])?;
-            Ok::<_, Failure>(-innovations.cost() - innovations.half_log_determinant - scale_cost(scale))
+            Ok::<_, Failure>(of(&self.model(scale).linearize(&x, &[])?, scale))
         };
         let mut at = NOISE_SCALES.iter().position(|s| *s >= from).unwrap_or(0);
         let mut best = density(NOISE_SCALES[at])?;
@@ -219,6 +228,8 @@ impl WindowFit<'_> {
         let cholesky = hessian.cholesky();
         let columns = deviations.len();
         let mut result = DMatrix::zeros(p, columns);
+        // The innovations were taken a short step before the optimum.
+        let Ok(here) = self.model(fitted.noise_scale).residuals(&x, &fitted.innovations.gains) else { return result };
         let Some(cholesky) = cholesky else {
             return result;
         };
@@ -232,12 +243,12 @@ impl WindowFit<'_> {
             let Ok(residuals) = model.residuals(&x, &fitted.innovations.gains) else {
                 continue;
             };
-            if residuals.len() != fitted.innovations.whitened.len() {
+            if residuals.len() != here.len() {
                 continue;
             }
             let slope = DVector::from_iterator(
                 residuals.len(),
-                residuals.iter().zip(&fitted.innovations.whitened).map(|(a, b)| (a - b) / step),
+                residuals.iter().zip(&here).map(|(a, b)| (a - b) / step),
             );
             result.set_column(column, &cholesky.solve(&(jacobian.transpose() * slope)));
         }
