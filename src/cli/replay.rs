@@ -205,6 +205,9 @@ impl Replay {
     fn new(arguments: &ReplayArguments, config: &Config) -> anyhow::Result<Self> {
         let mut settings = config.pipeline_settings(arguments.root_label.map(Label));
         settings.predict = arguments.predictions.is_some() || arguments.report.is_some() || arguments.record.is_some();
+        // A report and a recording take everything as it comes.
+        let at_once = arguments.report.is_some() || arguments.record.is_some();
+        settings.predict_beside_learning = !at_once && rayon::current_num_threads() > 1;
         let mut root_is_given = arguments.root_label.is_some();
         let mut learned_bags = Vec::new();
         let pipeline = match &arguments.load_model {

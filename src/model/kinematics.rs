@@ -970,11 +970,7 @@ struct LocalSolve {
 }
 
 /// By how much ln |matrix| falls without each window's share of it; greatest where nothing else holds.
-fn window_information(
-    matrix: &DMatrix<f64>,
-    systems: &[WindowSystem],
-    solves: &[Option<LocalSolve>],
-) -> Vec<f64> {
+fn window_information(matrix: &DMatrix<f64>, systems: &[WindowSystem], solves: &[Option<LocalSolve>]) -> Vec<f64> {
     let log_determinant = |matrix: DMatrix<f64>| {
         matrix.cholesky().map_or(f64::NEG_INFINITY, |c| 2.0 * c.l_dirty().diagonal().map(f64::ln).sum())
     };

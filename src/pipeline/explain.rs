@@ -456,9 +456,7 @@ impl<'a> Scene<'a> {
         let missing: Vec<_> = carriers.filter(|(label, (c, _))| !offers.carried.contains_key(&(*label, *c))).collect();
         let carried: Vec<_> = missing
             .par_iter()
-            .map(|&(label, (carrier, motion))| {
-                ((label, carrier), self.carried(label, carrier, &motion.displacements))
-            })
+            .map(|&(label, (carrier, motion))| ((label, carrier), self.carried(label, carrier, &motion.displacements)))
             .collect();
         offers.carried.extend(carried);
         let mut pairs: Vec<(Label, Option<Label>, usize)> = Vec::new();

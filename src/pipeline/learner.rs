@@ -500,14 +500,15 @@ impl Learner {
         let Some(track) = self.tracks.get(&label).and_then(|t| t.get(window)) else { return };
         let rests = track.windows(2).all(|pair| pair[0] == pair[1]);
         let every = if rests { frames.len().div_ceil(RESTING_FRAMES).max(1) } else { 1 };
-        let one = |(k, (frame, displacement)): (usize, (&Frame, &Pose))| {
-            match (self.models.get(&label), frame.scans.get(&label)) {
-                (Some(model), Some(scan)) if k % every == 0 => {
-                    let past = rays_past(frame, label, model, displacement);
-                    measure_faces(model, scan, &past, displacement, &settings)
-                }
-                _ => [None; 2],
+        let one = |(k, (frame, displacement)): (usize, (&Frame, &Pose))| match (
+            self.models.get(&label),
+            frame.scans.get(&label),
+        ) {
+            (Some(model), Some(scan)) if k % every == 0 => {
+                let past = rays_past(frame, label, model, displacement);
+                measure_faces(model, scan, &past, displacement, &settings)
             }
+            _ => [None; 2],
         };
         let faces: Vec<_> = frames.par_iter().zip(track).enumerate().map(one).collect();
         let measured_at = self.measured_at.entry(label).or_default();

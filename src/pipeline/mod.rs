@@ -1,5 +1,6 @@
 //! The one state machine that the node and the replay share.
 
+mod backlog;
 mod evaluate;
 mod explain;
 mod first_look;
@@ -37,10 +38,11 @@ use crate::math::Pose;
 use crate::model::{DeclaredPhysics, KinematicSettings, PoseMeasurement};
 use crate::registration::{AlignmentSettings, Quadratic, follow, thinned_cost};
 use crate::types::{Input, Label, Stamp};
+use backlog::{Backlog, News};
 use evaluate::Scoring;
 use explain::{FEWEST_POINTS, measurement_of, travel};
 use first_look::REFERENCE_FRAMES;
-use forecast::{Forecaster, mechanism_of};
+use forecast::Forecaster;
 use poses::{POSED_RADIUS, PoseBuffer, PosedPart, RECORD_GAP};
 use saved::Resumed;
 use windows::{CutWindow, frame_of};
@@ -76,6 +78,8 @@ pub struct PipelineSettings {
     pub declared: DeclaredPhysics,
     /// Whether to predict.
     pub predict: bool,
+    /// Predictions may be said late, in their order: they are made while windows are learned.
+    pub predict_beside_learning: bool,
     /// For prediction, a posterior counts from its window's close plus this \[s\].
     pub posterior_latency_s: f64,
     /// The stream does not wait: closed windows are handed out for a [`Worker`] to learn, and
@@ -163,7 +167,7 @@ pub struct Pipeline {
     /// the window's number.
     handed_out: VecDeque<(u64, BTreeMap<Label, Pose>)>,
     closed_windows: u64,
-    forecaster: Option<Forecaster>,
+    forecaster: Option<Backlog>,
     /// The latest stamp of a frame.
     newest: Option<Stamp>,
     /// Windows are scored, not learned.
@@ -179,7 +183,8 @@ pub struct Pipeline {
 impl Pipeline {
     /// A pipeline that has seen nothing.
     pub fn new(settings: PipelineSettings) -> Self {
-        let forecaster = settings.predict.then(|| Forecaster::new(&settings));
+        let may_wait = settings.predict_beside_learning && !settings.live;
+        let forecaster = settings.predict.then(|| Backlog::new(Forecaster::new(&settings), may_wait));
         Self {
             forecaster,
             poses: PoseBuffer::new(settings.poses),
@@ -236,7 +241,7 @@ impl Pipeline {
             }
             other => {
                 let predictions = match (&mut self.forecaster, &other) {
-                    (Some(forecaster), Input::Wrench(wrench)) => forecaster.push_wrench(wrench),
+                    (Some(forecaster), Input::Wrench(wrench)) => forecaster.push(News::Wrench(*wrench)),
                     _ => Vec::new(),
                 };
                 match (&mut self.cutter, other) {
@@ -258,8 +263,8 @@ impl Pipeline {
             outputs.extend(self.push_frame(stamp, &[]));
         }
         let window = self.cutter.as_mut().and_then(WindowCutter::flush);
-        outputs.extend(window.and_then(|window| self.close(window)));
-        outputs.extend(self.forecaster.iter_mut().flat_map(Forecaster::finish));
+        outputs.extend(window.into_iter().flat_map(|window| self.close(window)));
+        outputs.extend(self.forecaster.iter_mut().flat_map(Backlog::finish));
         outputs
     }
 
@@ -322,28 +327,28 @@ impl Pipeline {
             outputs.extend(self.open_reference());
         }
         let closed = window.is_some() && !self.settings.live;
-        outputs.extend(window.and_then(|window| self.close(window)));
+        outputs.extend(window.into_iter().flat_map(|window| self.close(window)));
         if let (Some(forecaster), Some(frame)) = (&mut self.forecaster, seen) {
-            if let Some(learner) = self.learner.as_deref().filter(|_| closed) {
-                forecaster.learned(learner, mechanism_of(learner), None);
+            if let Some(learner) = self.learner.as_ref().filter(|_| closed) {
+                outputs.extend(forecaster.push(News::Learned(Arc::clone(learner))));
             }
             let rest_force = self.cutter.as_ref().and_then(WindowCutter::rest_force).unwrap_or_default();
             let preview = self.preview.as_ref().filter(|_| self.first_look.is_some());
-            let learner = self.learner.as_ref().or(preview);
-            outputs.extend(forecaster.push_frame(frame, learner.map(AsRef::as_ref), zero, rest_force));
+            let learner = self.learner.as_ref().or(preview).cloned();
+            outputs.extend(forecaster.push(News::Frame { frame, learner, zero, rest_force }));
         }
         outputs
     }
 
     /// Poses stayed away: the window that is open ends with the last of them.
-    fn end_record(&mut self) -> Option<Output> {
+    fn end_record(&mut self) -> Vec<Output> {
         self.poses.end_record();
-        let window = self.cutter.as_mut().and_then(WindowCutter::end_record)?;
-        let output = self.close(window);
+        let Some(window) = self.cutter.as_mut().and_then(WindowCutter::end_record) else { return Vec::new() };
+        let mut outputs = self.close(window);
         if let (Some(forecaster), Some(learner), false) = (&mut self.forecaster, &self.learner, self.settings.live) {
-            forecaster.learned(learner, mechanism_of(learner), None);
+            outputs.extend(forecaster.push(News::Learned(Arc::clone(learner))));
         }
-        output
+        outputs
     }
 
     /// The frames of the first look, until something was learned of them.
@@ -393,28 +398,32 @@ impl Pipeline {
     }
 
     /// A window that closed is learned here, or handed out if live.
-    fn close(&mut self, window: CutWindow) -> Option<Output> {
+    fn close(&mut self, window: CutWindow) -> Vec<Output> {
         if self.settings.live && self.scoring.is_none() {
             let begin = match (&self.learner, &self.first_look) {
                 (Some(learner), _) => Begin::Learner(Arc::clone(learner)),
                 (None, Some(look)) => Begin::FirstLook(Arc::clone(look)),
-                (None, None) => return None,
+                (None, None) => return Vec::new(),
             };
             self.closed_windows += 1;
             self.handed_out.push_back((self.closed_windows, self.current.clone()));
-            return Some(Output::WindowClosed(Box::new(ClosedWindow::new(self.closed_windows, window, begin))));
+            return vec![Output::WindowClosed(Box::new(ClosedWindow::new(self.closed_windows, window, begin)))];
         }
-        let learner = self.learner.as_mut()?;
+        let Some(learner) = self.learner.as_mut() else { return Vec::new() };
         let job = window.job(nearest_label);
         if let Some(scoring) = &mut self.scoring {
             let learner = Arc::make_mut(learner);
             scoring.score(learner, &job);
             self.current.extend(learner.displacements.iter().map(|(l, d)| (*l, *d)));
-            return None;
+            return Vec::new();
         }
-        Arc::make_mut(learner).learn(&job);
+        let learning = Arc::make_mut(learner);
+        let forecaster = &mut self.forecaster;
+        let predict = || forecaster.as_mut().map_or_else(Vec::new, Backlog::catch_up);
+        let ((), mut outputs) = rayon::join(|| learning.learn(&job), predict);
         self.current.extend(learner.displacements.iter().map(|(l, d)| (*l, *d)));
-        Some(Output::Learned { span_s: job.span_s() })
+        outputs.push(Output::Learned { span_s: job.span_s() });
+        outputs
     }
 
     /// Takes over what a worker learned from a window handed out; older ones are not waited for any
@@ -435,7 +444,7 @@ impl Pipeline {
         self.learner = Some(Arc::clone(&learned.learner));
         (self.first_look, self.preview) = (None, None);
         if let Some(forecaster) = &mut self.forecaster {
-            forecaster.learned(&learned.learner, learned.mechanism.clone(), Some(&self.current));
+            forecaster.forecaster.learned(&learned.learner, learned.mechanism.clone(), Some(&self.current));
         }
         Output::Learned { span_s: learned.span_s }
     }

@@ -178,7 +178,7 @@ impl Pipeline {
         self.current = learner.displacements.clone();
         self.newcomers = (!unknown.is_empty()).then(Vec::new);
         if let Some(forecaster) = &mut self.forecaster {
-            forecaster.resumed(&learner, frame.time_s, positions);
+            forecaster.forecaster.resumed(&learner, frame.time_s, positions);
         }
         let root = learner.root;
         self.learner = Some(Arc::new(learner));

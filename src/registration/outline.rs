@@ -155,20 +155,23 @@ impl Outline {
     ) -> impl Iterator<Item = Crossing> + 'a {
         let rays = own.iter().map(|p| (p, true)).chain(others.iter().map(|p| (p, false)));
         let reach = self.half[0].hypot(self.half[1]) + EDGE_REACH;
+        // The plane is carried to the many rays: few of them meet it.
+        let center = reference_from_world.inverse().transform_point(&self.center);
+        let normal = reference_from_world.rotation.tr_mul(&self.normal);
         rays.filter_map(move |(scan_point, hit)| {
-            let eye = reference_from_world.transform_point(&scan_point.viewpoint_in_world?);
-            let end = reference_from_world.transform_point(&scan_point.point_in_world);
-            let height = self.normal.dot(&(end - self.center));
-            let ray = end - eye;
-            let fall = -self.normal.dot(&ray);
-            if fall < STEEP * ray.norm() || height > if hit { HIT_HEIGHT } else { PASS_HEIGHT } {
+            let end = scan_point.point_in_world;
+            let height = normal.dot(&(end - center));
+            if height > if hit { HIT_HEIGHT } else { PASS_HEIGHT } || (hit && height < -HIT_HEIGHT) {
                 return None;
             }
-            if hit && height < -HIT_HEIGHT {
+            let ray = end - scan_point.viewpoint_in_world?;
+            let fall = -normal.dot(&ray);
+            if fall < STEEP * ray.norm() {
                 return None;
             }
             let place = end + ray * (height / fall);
-            ((place - self.center).norm_squared() < reach * reach).then_some(Crossing { place, depth: -height, hit })
+            let near = (place - center).norm_squared() < reach * reach;
+            near.then(|| Crossing { place: reference_from_world.transform_point(&place), depth: -height, hit })
         })
     }
 
@@ -247,9 +250,16 @@ pub fn outline_quadratic(
 pub fn rays_near<'a>(others: impl Iterator<Item = &'a ScanPoint>, center: &Vector3<f64>, reach: f64) -> Vec<ScanPoint> {
     let near = |p: &&ScanPoint| {
         p.viewpoint_in_world.is_some_and(|eye| {
-            let ray = p.point_in_world - eye;
-            let along = (ray.dot(&(center - eye)) / ray.norm_squared()).clamp(0.0, 1.0);
-            (eye + ray * along - center).norm_squared() < reach * reach
+            let (ray, there) = (p.point_in_world - eye, center - eye);
+            let (along, length) = (ray.dot(&there), ray.norm_squared());
+            // The square of the distance to the ray, times `length` where its nearest point is between the ends.
+            if along <= 0.0 {
+                there.norm_squared() < reach * reach
+            } else if along >= length {
+                (p.point_in_world - center).norm_squared() < reach * reach
+            } else {
+                there.norm_squared() * length - along * along < reach * reach * length
+            }
         })
     };
     others.filter(near).copied().collect()

@@ -166,19 +166,15 @@ impl WindowFit<'_> {
 
     /// κ of the greatest likelihood at given parameters, by ascent over the grid; how many
     /// linearizations that took. `latest` are the innovations there with κ = `from`.
-    fn best_noise_scale(
-        &self,
-        point: &DVector<f64>,
-        from: f64,
-        latest: &Innovations,
-    ) -> Result<(f64, usize), Failure> {
+    fn best_noise_scale(&self, point: &DVector<f64>, from: f64, latest: &Innovations) -> Result<(f64, usize), Failure> {
         let mut x = self.base.clone();
         for (&at, value) in self.active.iter().zip(point.iter()) {
             x[at] = *value;
         }
         let mut tried = 0;
-        let of =
-            |innovations: &Innovations, scale| -innovations.cost() - innovations.half_log_determinant - scale_cost(scale);
+        let of = |innovations: &Innovations, scale| {
+            -innovations.cost() - innovations.half_log_determinant - scale_cost(scale)
+        };
         let mut density = |scale: f64| {
             if scale == from {
                 return Ok(of(latest, scale));
@@ -246,10 +242,8 @@ impl WindowFit<'_> {
             if residuals.len() != here.len() {
                 continue;
             }
-            let slope = DVector::from_iterator(
-                residuals.len(),
-                residuals.iter().zip(&here).map(|(a, b)| (a - b) / step),
-            );
+            let slope =
+                DVector::from_iterator(residuals.len(), residuals.iter().zip(&here).map(|(a, b)| (a - b) / step));
             result.set_column(column, &cholesky.solve(&(jacobian.transpose() * slope)));
         }
         result
