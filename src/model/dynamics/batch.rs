@@ -134,7 +134,7 @@ impl Hypothesis {
             Problem { hypothesis: self, windows, by_window, places, active, x, scales, latest: Vec::new() };
         for round in 0..=rounds {
             let start = DVector::from_iterator(problem.active.len(), problem.active.iter().map(|&i| problem.x[i]));
-            let settings = SolverSettings { steps, ..SolverSettings::default() };
+            let settings = SolverSettings { steps, keeps_last_linearization: true, ..SolverSettings::default() };
             let solution = solve(&mut problem, &prior, &start, &settings)?;
             spent += solution.steps;
             problem.set(&solution.point);

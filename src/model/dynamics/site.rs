@@ -224,8 +224,6 @@ impl WindowFit<'_> {
         let cholesky = hessian.cholesky();
         let columns = deviations.len();
         let mut result = DMatrix::zeros(p, columns);
-        // The innovations were taken a short step before the optimum.
-        let Ok(here) = self.model(fitted.noise_scale).residuals(&x, &fitted.innovations.gains) else { return result };
         let Some(cholesky) = cholesky else {
             return result;
         };
@@ -239,11 +237,13 @@ impl WindowFit<'_> {
             let Ok(residuals) = model.residuals(&x, &fitted.innovations.gains) else {
                 continue;
             };
-            if residuals.len() != here.len() {
+            if residuals.len() != fitted.innovations.whitened.len() {
                 continue;
             }
-            let slope =
-                DVector::from_iterator(residuals.len(), residuals.iter().zip(&here).map(|(a, b)| (a - b) / step));
+            let slope = DVector::from_iterator(
+                residuals.len(),
+                residuals.iter().zip(&fitted.innovations.whitened).map(|(a, b)| (a - b) / step),
+            );
             result.set_column(column, &cholesky.solve(&(jacobian.transpose() * slope)));
         }
         result
