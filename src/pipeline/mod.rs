@@ -9,6 +9,7 @@ mod learner;
 mod planning;
 mod poses;
 mod posterior;
+mod rest;
 mod retention;
 mod saved;
 mod touch;
@@ -325,10 +326,10 @@ impl Pipeline {
             if let Some(learner) = self.learner.as_deref().filter(|_| closed) {
                 forecaster.learned(learner, mechanism_of(learner), None);
             }
-            let rest_force = self.cutter.as_ref().and_then(WindowCutter::rest_force).unwrap_or_default();
+            let rest = self.cutter.as_ref().and_then(WindowCutter::rest_reading).unwrap_or_default();
             let preview = self.preview.as_ref().filter(|_| self.first_look.is_some());
             let learner = self.learner.as_ref().or(preview);
-            outputs.extend(forecaster.push_frame(frame, learner.map(AsRef::as_ref), zero, rest_force));
+            outputs.extend(forecaster.push_frame(frame, learner.map(AsRef::as_ref), zero, rest));
         }
         outputs
     }
