@@ -6,9 +6,8 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use nalgebra::Vector3;
-
 use super::forecast::{Forecaster, mechanism_of};
+use super::rest::RestReading;
 use super::{Frame, Learner, Output};
 use crate::types::{AppliedWrench, Stamp};
 
@@ -27,8 +26,8 @@ pub(super) enum News {
         learner: Option<Arc<Learner>>,
         /// Time zero.
         zero: Stamp,
-        /// What the sensor reads untouched \[N\].
-        rest_force: Vector3<f64>,
+        /// What the sensor reads untouched.
+        rest: RestReading,
     },
     /// A window was learned in the stream.
     Learned(Arc<Learner>),
@@ -63,8 +62,8 @@ impl Backlog {
         for news in self.waiting.drain(..) {
             match news {
                 News::Wrench(wrench) => outputs.extend(self.forecaster.push_wrench(&wrench)),
-                News::Frame { frame, learner, zero, rest_force } => {
-                    outputs.extend(self.forecaster.push_frame(frame, learner.as_deref(), zero, rest_force));
+                News::Frame { frame, learner, zero, rest } => {
+                    outputs.extend(self.forecaster.push_frame(frame, learner.as_deref(), zero, rest));
                 }
                 News::Learned(learner) => self.forecaster.learned(&learner, mechanism_of(&learner), None),
             }

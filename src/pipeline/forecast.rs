@@ -9,6 +9,7 @@ use std::sync::Arc;
 use nalgebra::{Matrix3, Vector3, Vector6};
 
 use super::explain::{measure, travel};
+use super::rest::RestReading;
 use super::touch::{Touch, Toucher, first_push};
 use super::whereabouts::{Told, Whereabouts};
 use super::{Frame, Learner, Output, PipelineSettings};
@@ -97,7 +98,7 @@ struct Pending {
     near: Option<(Label, Vector3<f64>)>,
     calibration: Calibration<3>,
     skills: BTreeMap<Label, [Skill; JUDGED.len()]>,
-    rest_force: Vector3<f64>,
+    rest: RestReading,
 }
 
 /// A prediction to be judged.
@@ -249,19 +250,19 @@ impl Forecaster {
         });
     }
 
-    /// Takes in a frame as it was measured; `rest_force` is what the sensor reads untouched \[N\].
+    /// Takes in a frame as it was measured; `rest` is what the sensor reads untouched.
     pub fn push_frame(
         &mut self,
         frame: Frame,
         learner: Option<&Learner>,
         zero: Stamp,
-        rest_force: Vector3<f64>,
+        rest: RestReading,
     ) -> Vec<Output> {
         self.zero = Some(zero);
         let early = std::mem::take(&mut self.early);
         let mut outputs: Vec<Output> = early.iter().flat_map(|wrench| self.push_wrench(wrench)).collect();
         self.labels.extend(frame.scans.keys().chain(frame.poses.keys()));
-        let touches = self.toucher.touches(&self.samples, &frame, &rest_force);
+        let touches = self.toucher.touches(&self.samples, &frame, &rest);
         let now_s = frame.time_s;
         let tool_sigma = self.toucher.tool_sigma();
         self.seen.push_back(Seen { time_s: now_s, frame, touches, tool_sigma });
@@ -292,7 +293,7 @@ impl Forecaster {
             near: self.toucher.near(APPROACH),
             calibration: self.calibration,
             skills: self.skills.clone(),
-            rest_force,
+            rest,
         });
         let state = self.state(&self.told).into_iter();
         outputs.extend(state.map(|(label, (displacement, twist))| Output::Tracked {
@@ -494,7 +495,7 @@ impl Forecaster {
     fn next_push(&self, pending: &Pending) -> Option<f64> {
         let first = self.samples.partition_point(|s| s.stamp_s <= pending.time_s);
         let end = self.samples.partition_point(|s| s.stamp_s <= pending.time_s + HORIZONS[2] + 1e-9);
-        first_push(&self.samples[first..end.max(first)], &pending.rest_force, self.toucher.threshold_n)
+        first_push(&self.samples[first..end.max(first)], &pending.rest, self.toucher.threshold_n)
     }
 
     /// Judges what was predicted for now, by where the parts are found.

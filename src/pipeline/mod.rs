@@ -10,6 +10,7 @@ mod learner;
 mod planning;
 mod poses;
 mod posterior;
+mod rest;
 mod retention;
 mod saved;
 mod touch;
@@ -332,10 +333,10 @@ impl Pipeline {
             if let Some(learner) = self.learner.as_ref().filter(|_| closed) {
                 outputs.extend(forecaster.push(News::Learned(Arc::clone(learner))));
             }
-            let rest_force = self.cutter.as_ref().and_then(WindowCutter::rest_force).unwrap_or_default();
+            let rest = self.cutter.as_ref().and_then(WindowCutter::rest_reading).unwrap_or_default();
             let preview = self.preview.as_ref().filter(|_| self.first_look.is_some());
             let learner = self.learner.as_ref().or(preview).cloned();
-            outputs.extend(forecaster.push(News::Frame { frame, learner, zero, rest_force }));
+            outputs.extend(forecaster.push(News::Frame { frame, learner, zero, rest }));
         }
         outputs
     }

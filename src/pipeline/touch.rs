@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::Vector3;
 
+use super::rest::RestReading;
 use super::{Frame, nearest_label};
 use crate::mechanism::WrenchSample;
 use crate::types::Label;
@@ -30,11 +31,16 @@ pub(super) struct Touch {
 }
 
 /// When the first of some readings pushes beyond `threshold_n` \[N\], smoothed as for contact \[s\].
-pub(super) fn first_push(samples: &[WrenchSample], rest_force: &Vector3<f64>, threshold_n: f64) -> Option<f64> {
-    samples.windows(2 * SMOOTHING + 1).find_map(|around| {
-        let mean = around.iter().map(|s| s.force_in_world).sum::<Vector3<f64>>() / around.len() as f64;
-        ((mean - rest_force).norm() > threshold_n).then_some(around[SMOOTHING].stamp_s)
-    })
+pub(super) fn first_push(samples: &[WrenchSample], rest: &RestReading, threshold_n: f64) -> Option<f64> {
+    let mut around = samples.windows(2 * SMOOTHING + 1);
+    around.find(|around| pushes(around, rest, threshold_n)).map(|around| around[SMOOTHING].stamp_s)
+}
+
+/// Whether the mean of some readings is a push.
+fn pushes(around: &[WrenchSample], rest: &RestReading, threshold_n: f64) -> bool {
+    let count = around.len() as f64;
+    let mean = around.iter().map(|s| s.force_in_world).sum::<Vector3<f64>>() / count;
+    rest.is_push(&mean, count, threshold_n)
 }
 
 /// A contact under way.
@@ -99,7 +105,7 @@ impl Toucher {
     }
 
     /// Readings since the last frame that are in contact, by part.
-    pub fn touches(&mut self, samples: &[WrenchSample], frame: &Frame, rest_force: &Vector3<f64>) -> Vec<Touch> {
+    pub fn touches(&mut self, samples: &[WrenchSample], frame: &Frame, rest: &RestReading) -> Vec<Touch> {
         let first = samples.partition_point(|s| s.stamp_s <= self.looked_s);
         let end = samples.partition_point(|s| s.stamp_s <= frame.time_s + 1e-9);
         self.looked_s = frame.time_s;
@@ -115,8 +121,7 @@ impl Toucher {
         let mut voted = false;
         for i in first..end {
             let around = &samples[i.saturating_sub(SMOOTHING)..(i + SMOOTHING + 1).min(end)];
-            let mean = around.iter().map(|s| s.force_in_world).sum::<Vector3<f64>>() / around.len() as f64;
-            let pushes = (mean - rest_force).norm() > self.threshold_n;
+            let pushes = pushes(around, rest, self.threshold_n);
             let sample = samples[i];
             if i >= 3 {
                 // Third differences of white noise have 20 times its variance; of a motion, next to none.

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::explain::Frame;
 use super::learner::WindowJob;
+use super::rest::RestReading;
 use crate::model::Contact;
 use crate::registration::ScanPoint;
 use crate::types::{AppliedWrench, Label, SegmentedCloud, Stamp};
@@ -103,8 +104,8 @@ struct Readings {
     settings: WindowSettings,
     zero: Stamp,
     wrenches: VecDeque<AppliedWrench>,
-    /// Rest readings by source, while nothing is touched or moves: force \[N\], torque \[N·m\].
-    rest: BTreeMap<usize, [Vector3<f64>; 2]>,
+    /// Rest readings by source, while nothing is touched or moves.
+    rest: BTreeMap<usize, RestReading>,
 }
 
 /// A window that closed, as it was cut from the stream: what was touched is still to be found.
@@ -144,10 +145,10 @@ impl WindowCutter {
         self.readings.wrenches.push_back(wrench);
     }
 
-    /// Rest reading of the force of a tool \[N\].
-    pub fn rest_force(&self) -> Option<Vector3<f64>> {
+    /// What a tool's sensor reads at rest.
+    pub(super) fn rest_reading(&self) -> Option<RestReading> {
         let tool = self.readings.wrenches.iter().find(|wrench| wrench.tool)?;
-        self.readings.rest.get(&tool.source).map(|[force, _]| *force)
+        self.readings.rest.get(&tool.source).copied()
     }
 
     /// Adds a frame; returns a window that closes with it. `moving`: whether a part still moves.
@@ -157,6 +158,7 @@ impl WindowCutter {
         if self.readings.rest.is_empty() {
             self.readings.track_rest(now - 10.0, now);
         }
+        let settled = self.readings.is_settled();
         // The newest reading may be younger than the cloud: look only up to the cloud.
         let steps = 4;
         let active = (1..=steps)
@@ -185,6 +187,7 @@ impl WindowCutter {
                 self.readings.track_rest(previous, now);
                 self.forget(now - self.readings.settings.lead_s - 0.2);
             }
+            Some(_) if !settled => self.readings.track_rest(previous, now),
             Some(_) => {}
         }
         let opened = self.open_since?;
@@ -304,29 +307,33 @@ impl Readings {
                 *tool = wrench.tool;
             }
         }
+        let least_n = self.settings.force_threshold_n;
         sums.into_iter().any(|(source, ([force, torque], count, tool))| {
-            let [rest_force, rest_torque] = self.rest.get(&source).copied().unwrap_or_default();
-            let push = (force / count - rest_force).norm();
-            let turn = (torque / count - rest_torque).norm() / TORQUE_LEVER;
-            push > self.settings.force_threshold_n || (!tool && turn > self.settings.force_threshold_n)
+            let rest = self.rest.get(&source).copied().unwrap_or_default();
+            if tool {
+                rest.is_push(&(force / count), count, least_n)
+            } else {
+                rest.is_left(&(force / count), &(torque / count), least_n, least_n * TORQUE_LEVER)
+            }
         })
     }
 
+    /// Whether the noise of every tool's readings is known.
+    fn is_settled(&self) -> bool {
+        let known = |wrench: &AppliedWrench| self.rest.get(&wrench.source).is_some_and(RestReading::is_settled);
+        self.wrenches.iter().filter(|wrench| wrench.tool).all(known)
+    }
+
     fn track_rest(&mut self, from_s: f64, to_s: f64) {
-        let mut sums: BTreeMap<usize, ([Vector3<f64>; 2], f64)> = BTreeMap::new();
-        for wrench in &self.wrenches {
-            let t = self.time(wrench);
-            if t > from_s && t <= to_s {
-                let ([force, torque], count) = sums.entry(wrench.source).or_default();
-                *force += wrench.force_in_world;
-                *torque += wrench.torque_in_world;
-                *count += 1.0;
-            }
-        }
-        for (source, (sums, count)) in sums {
-            let mean = sums.map(|sum| sum / count);
-            let rest = self.rest.entry(source).or_insert(mean);
-            *rest = [rest[0] * 0.9 + mean[0] * 0.1, rest[1] * 0.9 + mean[1] * 0.1];
+        let zero = self.zero;
+        let within = |wrench: &&AppliedWrench| {
+            let t = wrench.stamp.seconds_since(zero);
+            t > from_s && t <= to_s
+        };
+        let sources: BTreeSet<usize> = self.wrenches.iter().filter(within).map(|wrench| wrench.source).collect();
+        for source in sources {
+            let own = self.wrenches.iter().filter(within).filter(|wrench| wrench.source == source);
+            self.rest.entry(source).or_default().add(own);
         }
     }
 

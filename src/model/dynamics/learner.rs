@@ -25,6 +25,10 @@ const REST_ANGLE: f64 = 0.015;
 /// Linearizations for one window at most, and for all revisits after a window.
 const STEPS: usize = 14;
 const REVISIT_STEPS: usize = 12;
+/// A window whose noise is as much times what the wrench sensor explains may be fitted wrongly, and then ln
+/// friction is tried with these shifts.
+const DOUBTED: f64 = 100.0;
+const RELEASES: [f64; 2] = [-0.4, -1.0];
 /// A joint that stops at an end of its range stays there as long \[s\].
 const SHORTEST_HALT: f64 = 0.1;
 /// Effects in time are expected within a record of this length \[s\].
@@ -685,10 +689,29 @@ impl DynamicsLearner {
                     warm.x.get(active[i]).copied().flatten().unwrap_or(start[i])
                 })]
             }
+            // What the window itself said last is nearer to what it will say than what the others say of it.
+            None if self.windows[window].learned => {
+                let (posterior, _) = given_kinematics(&self.belief.product(None), &self.blocks())?.moments()?;
+                vec![DVector::from_fn(active.len(), |i, _| posterior[active[i]])]
+            }
             None => starts(&start, &covariance, active, &self.mechanism, moving),
         };
-        let noise_scale = warm.map(|w| w.noise_scale).or(self.windows[window].noise_scale);
-        let fitted = window_fit.fit(&prior, &starts, noise_scale, steps)?;
+        let remembered = self.windows[window].noise_scale.filter(|scale| *scale < DOUBTED);
+        let mut fitted = window_fit.fit(&prior, &starts, warm.map(|w| w.noise_scale).or(remembered), steps)?;
+        if warm.is_none() && fitted.noise_scale >= DOUBTED {
+            // Where friction holds a joint that moved, nothing says by how much it is too great.
+            for shift in RELEASES {
+                let other = with_friction(&start, shift, active, &self.mechanism, moving);
+                let trial = window_fit.fit(&prior, &[other], None, steps);
+                let spent = fitted.steps + trial.as_ref().map_or(1, |trial| trial.steps);
+                if let Ok(trial) = trial
+                    && trial.log_predictive > fitted.log_predictive
+                {
+                    fitted = trial;
+                }
+                fitted.steps = spent;
+            }
+        }
         let deviations = self.deviations(fit, &involved, input.use_tool || !self.windows[window].contacts.is_empty());
         let sensitivity = window_fit.sensitivity(&fitted, &deviations);
         let factor = self.factor(fit, &window_fit, &fitted, &sensitivity);
@@ -862,6 +885,18 @@ fn starts(
         }
     }
     starts
+}
+
+/// The point with ln friction of all moving joints shifted.
+fn with_friction(
+    point: &DVector<f64>,
+    shift: f64,
+    active: &[usize],
+    mechanism: &Mechanism,
+    moving: &[usize],
+) -> DVector<f64> {
+    let frictions: Vec<usize> = moving.iter().map(|&joint| mechanism.offset(joint) + super::layout::FRICTION).collect();
+    DVector::from_fn(point.len(), |i, _| point[i] + if frictions.contains(&active[i]) { shift } else { 0.0 })
 }
 
 /// Distribution of the dynamic numbers for the kinematics as fitted.

@@ -238,6 +238,20 @@ fn single_joints_are_recovered() {
     }
 }
 
+/// While other windows were wrong, a window may have been taken for noise.
+#[test]
+fn a_window_taken_for_noise_is_looked_at_again() {
+    let truth = Truth::single(true, 0.3, 0.4, 2.5);
+    let mut learner = DynamicsLearner::new(GRAVITY);
+    let (window, contact, q) = truth.window(2.5, 0.7, 2.0, &mut ChaCha8Rng::seed_from_u64(5));
+    let (contacts, positions, windows) = (&[contact], [q], &[&window]);
+    let input = DynamicsInput { windows, contacts, zero: Stamp(0), parts: &truth.hulls, use_tool: true };
+    let first = learner.learn_window(&truth.fit(&positions), &input);
+    learner.windows[0].noise_scale = Some(300.0);
+    let again = learner.learn_window(&truth.fit(&positions), &input);
+    assert!(first.noise_scale < 10.0 && again.noise_scale == first.noise_scale, "{first:?} {again:?}");
+}
+
 #[test]
 fn gravity_shows_how_a_slide_lies() {
     let (damping, friction, tilt) = (8.0, 3.0, 0.03);
