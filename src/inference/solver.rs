@@ -182,7 +182,7 @@ mod tests {
         assert!(solution.converged && (solution.point[0] - 2f64.ln()).abs() < 1e-3, "{solution:?}");
         let settings = SolverSettings { keeps_last_linearization: true, ..SolverSettings::default() };
         let kept = solve(&mut Exponential, &prior, &DVector::from_element(1, -3.0), &settings).expect("regular");
-        assert!(kept.converged && (kept.point - solution.point).amax() < 1e-3, "{kept:?}");
+        assert!(kept.converged && (&kept.point - &solution.point).amax() < 1e-3, "{kept:?}");
         assert!(
             (kept.log_evidence - solution.log_evidence).abs() < 0.01,
             "{} for {}",
