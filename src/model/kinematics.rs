@@ -899,6 +899,7 @@ impl<'a> Problem<'a> {
         let mut views: Vec<[Vec<(Look, DMatrix<f64>)>; 2]> = self.joints.iter().map(|_| Default::default()).collect();
         for (w, (window, solve)) in self.windows.iter().zip(solves).enumerate() {
             let Some(LocalSolve { coupling, .. }) = solve else { continue };
+            let error_of = |row: &PoseRow, frame: usize| errors[w][row.joint][frame][row.face].as_ref();
             for frame in 0..window.times_s.len() {
                 let displacements = forward(&self.joints, |j| self.positions[w][j][frame]);
                 let columns = self.twist_columns(w, frame, &displacements);
@@ -916,7 +917,7 @@ impl<'a> Problem<'a> {
                         views.push((look, DMatrix::zeros(globals, 6)));
                     }
                     let pull = &mut views[index].1;
-                    let Some(error) = &errors[w][row.joint][frame][row.face] else { continue };
+                    let Some(error) = error_of(&row, frame) else { continue };
                     let weighted = error * row.information;
                     if let Some(at) = row.error {
                         let mut own = pull.fixed_rows_mut::<6>(at);
