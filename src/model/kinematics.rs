@@ -211,7 +211,7 @@ pub struct KinematicFit {
     pub moves: Vec<Vec<usize>>,
     /// What each window adds to the cost, priors apart.
     pub window_costs: Vec<f64>,
-    /// By how much ln |information| of all that windows share would fall without each; none from [`fit_edge`].
+    /// By how much ln |information| of all that windows share would fall without each; none of an edge.
     pub window_information: Vec<f64>,
     /// Whether the last step was small.
     pub converged: bool,
