@@ -9,6 +9,7 @@ use std::sync::Arc;
 use nalgebra::{Matrix3, Vector3, Vector6};
 
 use super::explain::{measure, travel};
+use super::grip::Grip;
 use super::rest::RestReading;
 use super::touch::{Touch, Toucher, first_push};
 use super::whereabouts::{Told, Whereabouts};
@@ -125,6 +126,7 @@ pub(super) struct Forecaster {
     /// Moving parts as measured in the frame before.
     last: BTreeMap<Label, Pose>,
     toucher: Toucher,
+    grip: Option<Grip>,
     whereabouts: Whereabouts,
     told: BTreeMap<Label, Told>,
     /// Where parts were found, by time.
@@ -156,6 +158,7 @@ impl Forecaster {
             denials: 0,
             last: BTreeMap::new(),
             toucher: Toucher::new(settings.windows.force_threshold_n),
+            grip: None,
             whereabouts: Whereabouts::default(),
             told: BTreeMap::new(),
             found: BTreeMap::new(),
@@ -266,10 +269,15 @@ impl Forecaster {
         let now_s = frame.time_s;
         let tool_sigma = self.toucher.tool_sigma();
         self.seen.push_back(Seen { time_s: now_s, frame, touches, tool_sigma });
-        if !self.restart(now_s, learner)
-            && let (Some(filter), Some(seen)) = (&mut self.filter, self.seen.back())
-        {
+        if self.restart(now_s, learner) {
+            self.grip = None;
+        } else if let (Some(filter), Some(seen)) = (&mut self.filter, self.seen.back()) {
+            let positions = filter.positions().to_vec();
             follow(filter, seen, &self.samples, learner, (&mut self.denials, &mut self.last));
+            if let Some(learner) = learner.filter(|learner| learner.use_tool && self.toucher.bound.is_none()) {
+                let brought = (&seen.frame, seen.touches.as_slice());
+                Grip::look(&mut self.grip, brought, &positions, learner, (filter, &mut self.toucher));
+            }
         }
         let mut told = BTreeMap::new();
         if let Some(seen) = self.seen.back() {

@@ -5,6 +5,7 @@ mod evaluate;
 mod explain;
 mod first_look;
 mod forecast;
+mod grip;
 mod keyframes;
 mod learner;
 mod planning;

@@ -47,6 +47,8 @@ fn pushes(around: &[WrenchSample], rest: &RestReading, threshold_n: f64) -> bool
 struct ContactNow {
     label: Option<Label>,
     votes: BTreeMap<Label, usize>,
+    /// Its motion told which part it is.
+    sure: bool,
     last_push_s: f64,
     track: Vec<(f64, Vector3<f64>)>,
 }
@@ -99,6 +101,14 @@ impl Toucher {
         self.nearest.filter(|(.., distance)| *distance < reach_m).map(|(label, point, _)| (label, point))
     }
 
+    /// The tool holds this part, whichever is nearest.
+    pub fn takes(&mut self, label: Label) {
+        if let Some(contact) = &mut self.contact {
+            contact.label = Some(label);
+            contact.sure = true;
+        }
+    }
+
     /// Parts let go since this was last asked.
     pub fn let_go(&mut self) -> Vec<Label> {
         std::mem::take(&mut self.let_go)
@@ -139,6 +149,7 @@ impl Toucher {
             let contact = self.contact.get_or_insert_with(|| ContactNow {
                 label: None,
                 votes: BTreeMap::new(),
+                sure: false,
                 last_push_s: sample.stamp_s,
                 track: Vec::new(),
             });
@@ -150,7 +161,7 @@ impl Toucher {
             {
                 *contact.votes.entry(label).or_default() += 1;
                 let most = contact.votes.iter().max_by_key(|(_, votes)| **votes).map(|(label, _)| *label);
-                if contact.label != most {
+                if contact.label != most && !contact.sure {
                     begins = true;
                     contact.label = most;
                     contact.track.clear();

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector, Vector3};
 
-use crate::math::skew;
+use crate::math::{Pose, skew};
 use crate::mechanism::effects::{AttachedEffect, EffectKind};
 use crate::mechanism::{JointType, Tree};
 use crate::model::{DynamicsLearner, KinematicFit, KinematicJoint, SensorError};
@@ -87,6 +87,20 @@ pub struct TrackedMechanism {
     pub unexplained: Vec<f64>,
 }
 
+/// A body as the tool would have carried it along its joint.
+#[derive(Clone, Copy, Debug)]
+pub struct Carried {
+    /// Of its joint \[m or rad\].
+    pub position: f64,
+    /// The body's, in world.
+    pub displacement: Pose,
+    /// How far from the tool the point that it held is even so \[m\].
+    pub miss_m: f64,
+}
+
+/// Newton steps along a joint.
+const CARRY_STEPS: usize = 4;
+
 impl TrackedMechanism {
     /// From the last kinematic fit and the dynamics learned along with it; `None` where the dynamics
     /// are not known for these joints. `noise_scale` as inferred from the windows.
@@ -152,6 +166,26 @@ impl TrackedMechanism {
     /// The joints from a body to the world, the body's own first.
     pub fn chain(&self, body: usize) -> Vec<usize> {
         std::iter::successors(Some(body), |&joint| self.joints[joint].parent).collect()
+    }
+
+    /// Where a body's own joint goes, from `positions`, if it carries the tool from one position to another in
+    /// world \[m\].
+    pub fn carry(&self, positions: &[f64], body: usize, from: &Vector3<f64>, to: &Vector3<f64>) -> Carried {
+        let start = self.tree.displacements(positions)[body];
+        let joint = &self.joints[body];
+        let above = start * joint.screw().displacement(positions[body]).inverse();
+        let point = start.inverse().transform_point(&(from - self.tool_offset));
+        let place = |q: f64| above * joint.screw().displacement(q);
+        let miss = |q: f64| to - self.tool_offset - place(q).transform_point(&point);
+        let mut position = positions[body];
+        // By Newton's method, on a slide in one step.
+        for _ in 0..CARRY_STEPS {
+            let lacks = miss(position);
+            let step = 1e-5 / self.reach(body);
+            let slope = (lacks - miss(position + step)) / step;
+            position += slope.dot(&lacks) / slope.norm_squared().max(1e-9);
+        }
+        Carried { position, displacement: place(position), miss_m: miss(position).norm() }
     }
 
     /// Motion of a part's points by its joint's unit: 1 on a slide, metres on a hinge.

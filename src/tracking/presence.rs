@@ -8,7 +8,7 @@ use crate::math::{Pose, softmax};
 use crate::registration::{PartModel, ScanPoint, thinned_cost};
 
 /// Independent points that they are worth: neighbours share their errors.
-const INDEPENDENT: f64 = 20.0;
+pub const INDEPENDENT: f64 = 20.0;
 /// Share of the newest frame in the smoothed excess.
 const NEWEST: f64 = 0.4;
 /// Excess beyond which no account holds.

@@ -186,3 +186,13 @@ fn a_stop_may_wait_beyond_what_was_seen() {
     assert!(way(&unknown) < 0.9 * way(&known) && way(&unknown) > 0.5 * way(&known));
     assert!(unknown.covariances_m2[0][(0, 0)] > 2.0 * known.covariances_m2[0][(0, 0)]);
 }
+
+#[test]
+fn a_joint_carries_the_tool_as_far_as_it_can() {
+    let mechanism = drawer(8.0);
+    let tool = CONTACT + mechanism.tool_offset;
+    let carried = mechanism.carry(&[0.1], 0, &tool, &(tool + Vector3::new(0.05, 0.02, 0.0)));
+    let place = carried.displacement.translation;
+    assert!((carried.position - 0.15).abs() < 1e-9 && (place - Vector3::x() * 0.15).norm() < 1e-9, "{carried:?}");
+    assert!((carried.miss_m - 0.02).abs() < 1e-9, "{carried:?}");
+}

@@ -1,6 +1,6 @@
 //! The online learner of dynamics: sites of all windows, learned when they come, and revisited.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 
 use nalgebra::{DMatrix, DVector, Matrix2, Vector3};
 use serde::{Deserialize, Serialize};
@@ -25,6 +25,8 @@ const REST_ANGLE: f64 = 0.015;
 /// Linearizations for one window at most, and for all revisits after a window.
 const STEPS: usize = 14;
 const REVISIT_STEPS: usize = 12;
+/// Linearizations for one window with another end stop than it was just fitted with, at most.
+const STOP_STEPS: usize = 6;
 /// A window whose noise is as much times what the wrench sensor explains may be fitted wrongly, and then ln
 /// friction is tried with these shifts.
 const DOUBTED: f64 = 100.0;
@@ -136,7 +138,8 @@ impl WindowMemory {
 /// Where a fit starts: numbers, where they are known, and κ.
 pub(super) struct Warm {
     pub(super) x: Vec<Option<f64>>,
-    pub(super) noise_scale: f64,
+    /// `None`: it is chosen anew.
+    pub(super) noise_scale: Option<f64>,
 }
 
 /// Learns the dynamics from windows, given the kinematic fit of all of them.
@@ -562,21 +565,31 @@ impl DynamicsLearner {
         }
         let mut fitted = self.fit_window(window, fit, input, &moving, &frozen, (steps, None))?;
         let mut spent = fitted.1.steps;
-        // Stops where the joint arrived at the end of its range.
+        // Stops where the joint arrived at the end of its range; each then has to stand against all the others.
         let halts = if self.windows[window].learned { Vec::new() } else { self.halts(window, fit, &moving, input) };
-        for (joint, side, position) in halts {
+        let mut changes: VecDeque<_> = halts.into_iter().map(|(joint, side, at)| (joint, side, Some(at))).collect();
+        while let Some((joint, side, stop)) = changes.pop_front() {
             let label = fit.joints[joint].child;
             let before = self.joints.get(&label).cloned();
             if let Some(memory) = self.joints.get_mut(&label) {
-                memory.stops[side] = true;
-                memory.stop_positions[side] = position;
+                memory.stops[side] = stop.is_some();
+                memory.stop_positions[side] = stop.unwrap_or(0.0);
             }
             self.rebuild(fit)?;
-            let warm = Warm { x: fitted.2.clone(), noise_scale: fitted.1.noise_scale };
-            let trial = self.fit_window(window, fit, input, &moving, &frozen, (6, Some(&warm)));
+            // What a stop explains is no noise any more.
+            let noise_scale = Some(fitted.1.noise_scale).filter(|scale| *scale < DOUBTED);
+            let steps = if noise_scale.is_some() { STOP_STEPS } else { STEPS };
+            let warm = Warm { x: fitted.2.clone(), noise_scale };
+            let trial = self.fit_window(window, fit, input, &moving, &frozen, (steps, Some(&warm)));
             spent += trial.as_ref().map_or(0, |t| t.1.steps);
+            let least = if stop.is_some() { STOP_EVIDENCE } else { -STOP_EVIDENCE };
             match trial {
-                Ok(trial) if trial.1.log_predictive > fitted.1.log_predictive + STOP_EVIDENCE => fitted = trial,
+                Ok(trial) if trial.1.log_predictive > fitted.1.log_predictive + least => {
+                    let gain = trial.1.log_predictive - fitted.1.log_predictive;
+                    tracing::debug!(window, %label, side, ?stop, gain, noise = trial.1.noise_scale, "end stop");
+                    fitted = trial;
+                    changes.extend(stop.map(|_| (joint, side, None)));
+                }
                 _ => {
                     if let Some(before) = before {
                         self.joints.insert(label, before);
@@ -697,7 +710,8 @@ impl DynamicsLearner {
             None => starts(&start, &covariance, active, &self.mechanism, moving),
         };
         let remembered = self.windows[window].noise_scale.filter(|scale| *scale < DOUBTED);
-        let mut fitted = window_fit.fit(&prior, &starts, warm.map(|w| w.noise_scale).or(remembered), steps)?;
+        let noise_scale = warm.map_or(remembered, |warm| warm.noise_scale);
+        let mut fitted = window_fit.fit(&prior, &starts, noise_scale, steps)?;
         if warm.is_none() && fitted.noise_scale >= DOUBTED {
             // Where friction holds a joint that moved, nothing says by how much it is too great.
             for shift in RELEASES {

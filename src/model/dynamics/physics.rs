@@ -180,7 +180,7 @@ impl DynamicsLearner {
             let known = noise_scales.iter().find(|(index, _)| *index == window).map(|(_, scale)| *scale);
             // The site of a batch's window is its linearization there; others start from it.
             let steps = if known.is_some() { 1 } else { 4 };
-            let noise_scale = known.or(self.windows[window].noise_scale).unwrap_or(1.0);
+            let noise_scale = Some(known.or(self.windows[window].noise_scale).unwrap_or(1.0));
             let warm = Warm { x: x.iter().copied().map(Some).collect(), noise_scale };
             match self.fit_window(window, fit, input, &moving, &frozen, (steps, Some(&warm))) {
                 Ok((factor, fitted, _)) => {

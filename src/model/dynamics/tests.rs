@@ -16,7 +16,7 @@ use super::track::{TrackKinematics, TrackSource, joint_track};
 use crate::geometry::HullProperties;
 use crate::inference::{Sampler, SamplingSettings};
 use crate::math::{Pose, Screw, orthonormal_pair};
-use crate::mechanism::{Body, JointParameters, JointType, State, Tree, WrenchSample, WrenchTrack, rollout};
+use crate::mechanism::{Body, JointParameters, JointType, Limit, State, Tree, WrenchSample, WrenchTrack, rollout};
 use crate::model::{Axis, Contact, KinematicFit, KinematicJoint, WindowObservations};
 use crate::types::{AppliedWrench, Label, Stamp};
 
@@ -250,6 +250,23 @@ fn a_window_taken_for_noise_is_looked_at_again() {
     learner.windows[0].noise_scale = Some(300.0);
     let again = learner.learn_window(&truth.fit(&positions), &input);
     assert!(first.noise_scale < 10.0 && again.noise_scale == first.noise_scale, "{first:?} {again:?}");
+}
+
+/// Where a joint turns round, it stays a little: that is the end of its range only where something holds it.
+#[test]
+fn an_end_that_a_joint_runs_into_is_a_stop_and_one_where_it_turns_round_is_none() {
+    let free = Truth::single(true, 0.3, 0.4, 2.5);
+    let mut bodies = vec![body(&free.joints[0], 2.5, Vector3::new(0.2, 0.0, 0.0), 0.3, 0.4)];
+    bodies[0].parameters.upper = Some(Limit::at(0.45));
+    let stopped = Truth { tree: Tree::new(bodies, GRAVITY).unwrap(), ..Truth::single(true, 0.3, 0.4, 2.5) };
+    for (truth, stops) in [(free, [false, false]), (stopped, [false, true])] {
+        let mut learner = DynamicsLearner::new(GRAVITY);
+        let (window, contact, q) = truth.window(2.5, 0.7, 2.0, &mut ChaCha8Rng::seed_from_u64(5));
+        let (contacts, positions, windows) = (&[contact], [q], &[&window]);
+        let input = DynamicsInput { windows, contacts, zero: Stamp(0), parts: &truth.hulls, use_tool: true };
+        let result = learner.learn_window(&truth.fit(&positions), &input);
+        assert_eq!(learner.mechanism().joints[0].stops, stops, "{result:?}");
+    }
 }
 
 #[test]
