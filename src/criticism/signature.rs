@@ -28,8 +28,9 @@ pub struct Ranked {
     pub gain: f64,
     /// Its numbers to start a fit from.
     pub start: Vec<f64>,
-    /// What comes with it: friction on the other joints, where it is declared on none.
-    pub also: Vec<Addition>,
+    /// What comes with it, with the numbers to start from: friction on other joints, where it is declared on
+    /// none.
+    pub also: Vec<(Addition, Vec<f64>)>,
 }
 
 /// Normal equations of probes on one joint, or of the sensor's errors, the model eliminated.
