@@ -94,7 +94,8 @@ impl Critic {
         let (selected, findings, scales) = {
             let workshop =
                 Workshop { learner, fit, input, rest_prior: rest_prior.clone(), sensor_scales: SENSOR_SCALES, spans };
-            let found = self.stages.last().filter(|_| known_joints).map(|step| step.additions.clone()).unwrap_or_default();
+            let found =
+                self.stages.last().filter(|_| known_joints).map(|step| step.additions.clone()).unwrap_or_default();
             let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref(), found: &found };
             let base = selector.base(&numbers)?;
             tracing::debug!(evidence = base.log_evidence, additions = ?base.additions, kappa = ?noise_scales(&base, &batch), "base");

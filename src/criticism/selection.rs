@@ -36,13 +36,17 @@ const HALT_S: f64 = 0.2;
 const KNOWN: f64 = 1e9;
 /// κ that fits start from; the base model's from both, as a wrong model has more than one optimum.
 const FIRST_SCALES: [f64; 2] = [10.0, 1e3];
+/// Some candidates start with κ larger by this, too.
+const WIDENED: f64 = 30.0;
 /// A delay is tried from these \[scales\]: the motion's dependence on it is far from linear.
 const DELAYS: [f64; 4] = [-0.8, 0.3, 1.0, 2.0];
-/// With friction on every joint from these.
+/// Where several joints move, and with friction on every joint: motors report their torques with little delay.
 const SHORT_DELAYS: [f64; 2] = [-0.1, 0.1];
 /// A review ends at this many linearizations of all windows beyond the base model's: more windows take longer,
 /// and do not leave less time for each candidate.
 const BUDGET: usize = 350;
+/// A model that was taken is fitted on at most so often, while that gains as much \[nats\].
+const SETTLING: (usize, f64) = (3, 1.0);
 /// Linearizations of a refit, and how often κ is chosen anew.
 const REFIT: (usize, usize) = (8, 2);
 /// Where several joints move, candidates are first fitted as little as this, and the best few refitted.
@@ -239,6 +243,7 @@ impl Selector<'_> {
             }
         }
         let mut current = best.ok_or(Failure::Diverged)?;
+        self.settle(&mut current)?;
         for component in current.components.clone() {
             for &joint in &component.joints {
                 let moved = component.windows.iter().any(|&w| self.batch[w].moving.contains(&joint));
@@ -311,6 +316,7 @@ impl Selector<'_> {
                 match self.pair(&current, best, friction_declared, least)? {
                     Some(pair) => {
                         current = pair;
+                        self.settle(&mut current)?;
                         current.note_step();
                     }
                     None => break,
@@ -327,6 +333,7 @@ impl Selector<'_> {
             self.take(&mut current, best);
             current.rivals.extend(best.also.iter().map(|other| (*other, vec![(None, -best.gain)])));
             current.rivals.insert(addition, rivals);
+            self.settle(&mut current)?;
             self.drop_what_is_not_needed(&mut current, addition)?;
             current.note_step();
         }
@@ -366,7 +373,10 @@ impl Selector<'_> {
         let mut bland = current.clone();
         bland.numbers.joints.clear();
         let alone = |starts: Vec<(&'_ Selection, f64)>| -> Vec<_> {
-            starts.into_iter().map(|(from, start)| (from.clone(), Ranked { start: vec![start], ..candidate.clone() })).collect()
+            starts
+                .into_iter()
+                .map(|(from, start)| (from.clone(), Ranked { start: vec![start], ..candidate.clone() }))
+                .collect()
         };
         // Friction on several joints, each by its own force, and a delay with it or none.
         let friction = |joint: usize, share: f64| {
@@ -383,13 +393,19 @@ impl Selector<'_> {
         let from_both = || [current, &bland].into_iter().zip(FRICTION_STARTS);
         let starts: Vec<(Selection, Ranked)> = match candidate.addition {
             Addition::Delay if candidate.also.is_empty() => {
-                alone([current, &bland].into_iter().flat_map(|from| DELAYS.map(|delay| (from, delay))).collect())
+                let delays =
+                    if self.several() { [SHORT_DELAYS[0], SHORT_DELAYS[1], DELAYS[1], DELAYS[2]] } else { DELAYS };
+                alone([current, &bland].into_iter().flat_map(|from| delays.map(|delay| (from, delay))).collect())
             }
             Addition::Delay => from_both()
                 .flat_map(|(from, share)| SHORT_DELAYS.map(|delay| together(from, share, vec![delay])))
                 .collect(),
             Addition::Friction(joint) => {
                 from_both().map(|(from, share)| together(from, share, friction(joint, share))).collect()
+            }
+            // Far from where friction and an offset are: with wide process noise the way there is smoother.
+            Addition::Effect(_, EffectKind::AsymmetricFriction) if !self.several() => {
+                [current.clone(), widened(current)].into_iter().map(|from| (from, candidate.clone())).collect()
             }
             _ => return self.trial(current, candidate, if self.several() { GLANCE } else { REFIT }),
         };
@@ -555,6 +571,15 @@ impl Selector<'_> {
         let mut additions = current.additions.clone();
         additions.insert(addition);
         additions.extend(candidate.also.iter().map(|(other, _)| *other));
+        // What differs by direction has friction and an offset in it, and stands in their place.
+        let mut replaced_offset = None;
+        if let Addition::Effect(joint, EffectKind::AsymmetricFriction) = addition {
+            additions.remove(&Addition::Friction(joint));
+            let offset = Addition::Effect(joint, EffectKind::GravityOffset);
+            if additions.remove(&offset) {
+                replaced_offset = current.numbers.added.get(&offset).and_then(|theta| theta.first().copied());
+            }
+        }
         // What pulls towards the closed position leans on its stop, which shows only now.
         let stop = self.closed_stop(addition).filter(|stop| additions.insert(*stop));
         let hypothesis = self.workshop.hypothesis(&additions)?;
@@ -564,8 +589,13 @@ impl Selector<'_> {
             && let Some(effect) = hypothesis.mechanism.joints[joint].effects.last()
             && !numbers.joints.is_empty()
             && !start.is_empty()
+            && candidate.gain < KNOWN
         {
-            start = start_by_direction(&numbers.joints[joint], &start, kind, &effect.scales);
+            let offset = replaced_offset.map(|theta| {
+                let law = &EffectKind::GravityOffset.parameters()[0];
+                law.physical(theta, &effect.scales)
+            });
+            start = start_by_direction(&numbers.joints[joint], &start, offset, kind, &effect.scales);
         }
         numbers.added.extend(candidate.also.iter().cloned());
         numbers.added.insert(addition, start);
@@ -626,8 +656,34 @@ impl Selector<'_> {
         new.then_some(Addition::Stop(joint, upper))
     }
 
+    /// Fits a model on until that gains nothing more: else whatever is added next gains what was left to find
+    /// without it.
+    fn settle(&self, current: &mut Selection) -> Result<(), Failure> {
+        let hypothesis = self.workshop.hypothesis(&current.additions)?;
+        for component in &mut current.components {
+            let windows: Vec<&BatchWindow> = component.windows.iter().map(|&w| &self.batch[w]).collect();
+            for _ in 0..SETTLING.0 {
+                let Some(fitted) = &component.fitted else { break };
+                let scales: Vec<f64> = fitted.windows.iter().map(|window| window.noise_scale).collect();
+                let refitted = hypothesis.fit(&windows, &fitted.x, &scales, REFIT)?;
+                current.steps += refitted.steps * self.weight(&component.windows);
+                let gain = refitted.log_evidence - fitted.log_evidence;
+                if gain > 0.0 {
+                    current.numbers.take(&hypothesis, &current.additions, &refitted.x, &component.joints);
+                    current.log_evidence += gain;
+                    component.fitted = Some(refitted);
+                }
+                if gain < SETTLING.1 {
+                    break;
+                }
+            }
+        }
+        Ok(())
+    }
+
     fn take(&self, current: &mut Selection, trial: &Trial) {
         current.additions.clone_from(&trial.additions);
+        current.rivals.retain(|addition, _| trial.additions.contains(addition));
         for (places, fitted) in &trial.fits {
             let together = current.additions.iter().any(|a| a.joint().is_none());
             if together {
@@ -673,16 +729,6 @@ impl Selector<'_> {
         {
             let mut fewer = current.additions.clone();
             fewer.remove(&addition);
-            if let (Addition::Friction(joint), Addition::Effect(other, EffectKind::AsymmetricFriction)) =
-                (addition, newest)
-                && joint == other
-            {
-                // It stands in its place: nothing depends on it any more.
-                current.additions = fewer;
-                current.rivals.remove(&addition);
-                self.lay_out(current);
-                continue;
-            }
             let without = self.fitted(&fewer, &current.numbers, (6, 1))?;
             current.steps += without.steps;
             tracing::debug!(?addition, loss = current.log_evidence - without.log_evidence, "without");
@@ -762,6 +808,17 @@ impl Selector<'_> {
         }
         Ok(current)
     }
+}
+
+/// The same with larger κ.
+fn widened(selection: &Selection) -> Selection {
+    let mut wide = selection.clone();
+    for fitted in wide.components.iter_mut().filter_map(|component| component.fitted.as_mut()) {
+        for window in &mut fitted.windows {
+            window.noise_scale *= WIDENED;
+        }
+    }
+    wide
 }
 
 /// Whether a window that moves a joint needs far more process noise than the sensor explains.

@@ -442,12 +442,19 @@ impl Probes {
     }
 }
 
-/// Numbers of a joint that asymmetric friction starts from, given the declared ones.
-pub fn start_by_direction(declared: &[f64], start: &[f64], kind: EffectKind, scales: &Scales) -> Vec<f64> {
+/// Numbers of a joint that asymmetric friction starts from, given the declared ones: with the `offset` that it
+/// takes the place of, or what its signature suggests \[N or N·m\].
+pub fn start_by_direction(
+    declared: &[f64],
+    start: &[f64],
+    offset: Option<f64>,
+    kind: EffectKind,
+    scales: &Scales,
+) -> Vec<f64> {
     let parameters = kind.parameters();
     let (friction, damping) = (declared[crate::model::FRICTION].exp(), declared[crate::model::DAMPING].exp());
     let physical: Vec<f64> = parameters.iter().zip(start).map(|(p, theta)| p.physical(*theta, scales)).collect();
-    let half = 0.5 * (physical[1] - physical[0]);
+    let half = offset.unwrap_or(0.5 * (physical[1] - physical[0]));
     let values = [(friction - half).max(0.1 * friction), (friction + half).max(0.1 * friction), damping, damping];
     debug_assert!(declared.len() >= SIZE);
     let thetas = parameters.iter().zip(values);

@@ -128,8 +128,17 @@ impl Hypothesis {
         let mut scales = scales.to_vec();
         let mut x = x.to_vec();
         let mut spent = 0;
-        let mut problem =
-            Problem { hypothesis: self, windows, by_window, places, active, x, scales, latest: Vec::new(), kept: Vec::new() };
+        let mut problem = Problem {
+            hypothesis: self,
+            windows,
+            by_window,
+            places,
+            active,
+            x,
+            scales,
+            latest: Vec::new(),
+            kept: Vec::new(),
+        };
         for round in 0..=rounds {
             let start = DVector::from_iterator(problem.active.len(), problem.active.iter().map(|&i| problem.x[i]));
             let settings = SolverSettings { steps, ..SolverSettings::default() };

@@ -6,8 +6,8 @@ use nalgebra::{DMatrix, DVector, Matrix2, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::layout::{
-    AddedEffect, AddedTable, CenterFrame, INERTIA, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism, SENSOR_SIZE,
-    SIZE, SensorModel, TILT, TiltFrame, UPPER, joint_models,
+    AddedEffect, AddedTable, CenterFrame, INERTIA, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism,
+    SENSOR_SIZE, SIZE, SensorModel, TILT, TiltFrame, UPPER, joint_models,
 };
 use super::site::{FittedWindow, WindowFit, inertial_entries, load_factor};
 use super::track::{Drive, TrackKinematics, TrackSource, driven_labels, joint_track, touched_label};
