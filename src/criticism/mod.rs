@@ -121,6 +121,11 @@ impl Critic {
                 (base.clone(), before, selector.select(base)?)
             };
             let mut selected = selector.describe_leftover(selected)?;
+            // What explains most windows no better than noise would says nothing of what they lack.
+            let scales = noise_scales(&selected, batch).into_iter().map(|(_, scale)| scale).collect();
+            if crate::math::median(scales).is_some_and(|scale| scale >= OUTLYING.0) {
+                return Err(Failure::Diverged);
+            }
             let mut after = before.clone();
             if !selected.rivals.is_empty() {
                 match scores(&workshop, batch, &selected) {

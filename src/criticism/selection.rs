@@ -40,7 +40,7 @@ const FIRST_SCALES: [f64; 2] = [10.0, 1e3];
 const WIDENED: f64 = 30.0;
 /// A delay is tried from these \[scales\]: the motion's dependence on it is far from linear.
 const DELAYS: [f64; 4] = [-0.8, 0.3, 1.0, 2.0];
-/// Where several joints move, and with friction on every joint: motors report their torques with little delay.
+/// A chain whose friction is to be found, as motors' is: they report their torques with little delay.
 const SHORT_DELAYS: [f64; 2] = [-0.1, 0.1];
 /// A review ends at this many linearizations of all windows beyond the base model's: more windows take longer,
 /// and do not leave less time for each candidate.
@@ -393,8 +393,8 @@ impl Selector<'_> {
         let from_both = || [current, &bland].into_iter().zip(FRICTION_STARTS);
         let starts: Vec<(Selection, Ranked)> = match candidate.addition {
             Addition::Delay if candidate.also.is_empty() => {
-                let delays =
-                    if self.several() { [SHORT_DELAYS[0], SHORT_DELAYS[1], DELAYS[1], DELAYS[2]] } else { DELAYS };
+                let motors = self.several() && !self.workshop.learner.declared().friction;
+                let delays = if motors { [SHORT_DELAYS[0], SHORT_DELAYS[1], DELAYS[1], DELAYS[2]] } else { DELAYS };
                 alone([current, &bland].into_iter().flat_map(|from| delays.map(|delay| (from, delay))).collect())
             }
             Addition::Delay => from_both()
