@@ -5,6 +5,8 @@
 //! `criticism_benchmark` last printed it into `docs/criticism_benchmark.md`.
 #![allow(clippy::print_stderr, reason = "a program for the command line")]
 
+#[path = "criticism_report/doors.rs"]
+mod doors;
 #[path = "criticism_report/plot.rs"]
 mod plot;
 #[path = "criticism_report/study.rs"]
@@ -47,6 +49,9 @@ fn main() -> anyhow::Result<()> {
             section(&mut text, &study.run()?, &docs)?;
             fs::write(docs.join("criticism.md"), &text)?;
         }
+        eprintln!("door_survey");
+        doors::section(&mut text, &measured.join("door_survey/doors.csv"), root, scratch.path())?;
+        fs::write(docs.join("criticism.md"), &text)?;
     } else {
         text.push_str("\nSKIPPED: the records are not beside the repository.\n");
     }
@@ -74,14 +79,6 @@ fn studies(measured: &Path, root: &Path, scratch: &Path) -> anyhow::Result<Vec<S
     };
     studies.push(split("emps/emps.csv", "emps.toml", "emps.yaml", "emps", &[])?);
     studies.push(split("pr2_door/ikea_cabinet_log.csv", "pr2_door.toml", "pr2_door.yaml", "pr2_door", &[])?);
-    for (name, door) in [
-        ("door_survey_kitchen", "hai_kitchen_cabinet_lower_right"),
-        ("door_survey_office", "HSI_kitchen_cabinet_right_charlie"),
-        ("door_survey_ikea", "ikea_cabinet_pr2_robot"),
-    ] {
-        let select = [("mechanism", door)];
-        studies.push(split("door_survey/doors.csv", "door_survey.toml", "door_survey.yaml", name, &select)?);
-    }
     for (name, toml) in
         [("double_pendulum", "double_pendulum.toml"), ("double_pendulum_measured", "double_pendulum_measured.toml")]
     {

@@ -326,6 +326,35 @@ fn errors_name_file_column_and_line() {
 }
 
 #[test]
+fn a_row_with_an_empty_cell_is_left_out_and_counted() {
+    let folder = tempfile::tempdir().unwrap();
+    let parts = "[[parts]]\nlabel = 1\nposition = [\"x\", \"y\", \"z\"]\nnoise = { position_m = 0.001 }\n";
+    let import = |table: &str, spec: &str| {
+        let (table, spec) = (written(&folder, "table.csv", table), written(&folder, "spec.toml", spec));
+        let bag = folder.path().join("out.mcap");
+        bom(&["import", text(&table), "--spec", text(&spec), "-o", text(&bag)])
+    };
+    // A column that is not read may be empty; a cell that is read, or the time, may not.
+    let table = "t,x,y,z,note\n0,1,2,3,\n1,1,,3,\n,1,2,3,\n2,1,2,3,a\n";
+    let outcome = import(table, &format!("[time]\ncolumn = \"t\"\n{parts}"));
+    assert_eq!(outcome.status, 0, "{outcome:?}");
+    assert!(outcome.out.contains("2 readings (4 rows in"), "{}", outcome.out);
+    assert!(outcome.out.contains("; 2 left out for an empty cell)"), "{}", outcome.out);
+    let outcome = import("t,x,y,z\n0,1,2,3\n1,1,2,3\n", &format!("[time]\ncolumn = \"t\"\n{parts}"));
+    assert!(!outcome.out.contains("left out"), "{}", outcome.out);
+    // Of a sweep only the reading goes.
+    let joint = "joint = { type = \"prismatic\", axis = [1, 0, 0], position = \"at\" }\n";
+    let spec = format!(
+        "[time]\nrate_hz = 10\n[sweep]\ncolumns = \"f{{}}\"\nfrom = 0\nto = 2\nindex = \"at\"\nvalue = \"f\"\n\
+         pause_s = 1\n[[parts]]\nlabel = 1\n{joint}noise = {{ position_m = 0.001, rotation_rad = 0.001 }}\n\
+         [[wrenches]]\npart = 1\neffort = \"f\"\n"
+    );
+    let outcome = import("f0,f1,f2\n1,,3\n4,5,6\n", &spec);
+    assert!(outcome.out.contains("5 readings (2 rows in"), "{outcome:?}");
+    assert!(outcome.out.contains("; 1 left out for an empty cell)"), "{outcome:?}");
+}
+
+#[test]
 fn a_robots_hook_tells_the_cabinets_hinge() {
     let Some(table) = measured("pr2_door/ikea_cabinet_log.csv") else { return };
     let folder = tempfile::tempdir().unwrap();

@@ -87,10 +87,11 @@ fn a_drive_lacks_friction_then_an_offset() {
     let offset =
         ladder.iter().find(|(effects, _)| has(effects, "gravity_offset") || has(effects, "asymmetric_friction"));
     let (_, parts) = offset.unwrap_or_else(|| panic!("no step with an offset: {ladder:?}"));
-    assert!(parts[0].0 <= 3.5 && parts[0].1 <= 2.0e-3, "{ladder:?}");
-    // What is left goes by direction; it is found, though not always by that name.
-    let (_, parts) = ladder.last().unwrap();
-    assert!(parts[0].0 <= 3.1, "{ladder:?}");
+    assert!(parts[0].0 <= 3.5 && parts[0].1 < 0.5 * base[0].1, "{ladder:?}");
+    // What is left goes by direction, and is named so.
+    let (last, parts) = ladder.last().unwrap();
+    assert!(has(last, "asymmetric_friction") && !has(last, "unknown"), "{ladder:?}");
+    assert!(parts[0].0 <= 3.1 && parts[0].1 <= 2.0e-3, "{ladder:?}");
 }
 
 #[test]
@@ -104,6 +105,47 @@ fn a_cabinets_hinge_closes_itself() {
     let closes = |name: &str| ["self_closing", "position_friction"].contains(&name);
     assert!(criticism.effects.iter().any(|effect| closes(&effect.name)), "{criticism:?}");
     let ladder = study.ladder("score.mcap");
+    // A door that nothing could move, or that a stop held, would leave no force.
+    let (_, base) = &ladder[0];
+    assert!(base[0].0 > 0.9 && base[0].1 > 0.03, "{ladder:?}");
     let (_, parts) = ladder.last().unwrap();
-    assert!(parts[0].0 <= 0.5, "{ladder:?}");
+    assert!(parts[0].0 <= 0.5 && parts[0].1 < 0.5 * base[0].1, "{ladder:?}");
+}
+
+#[test]
+fn motors_rub_and_answer_late() {
+    let Some(table) = measured("double_pendulum/record_00.csv") else { return };
+    let Some(other) = measured("double_pendulum/record_06.csv") else { return };
+    let study = Study::new("double_pendulum");
+    study.import(&table, "double_pendulum", "fit.mcap", &[]);
+    study.import(&other, "double_pendulum", "score.mcap", &[]);
+    study.learn("fit.mcap", &[]);
+    let ladder = study.ladder("score.mcap");
+    let (_, base) = &ladder[0];
+    let (first, parts) = &ladder[1];
+    assert_eq!(first, &["friction", "friction"], "on both joints");
+    for (before, after) in base.iter().zip(parts) {
+        assert!(after.1 < 0.6 * before.1, "{ladder:?}");
+    }
+    let (_, late) = ladder.iter().find(|(effects, _)| has(effects, "wrench_delay")).unwrap();
+    for (before, after) in parts.iter().zip(late) {
+        assert!(after.1 < before.1, "{ladder:?}");
+    }
+    // An offset is none of it.
+    assert!(ladder.iter().all(|(effects, _)| !has(effects, "gravity_offset")), "{ladder:?}");
+}
+
+#[test]
+fn a_cabinet_door_closes_itself_by_static_forces_alone() {
+    let Some(table) = measured("door_survey/doors.csv") else { return };
+    let study = Study::new("door_survey");
+    for split in ["fit", "score"] {
+        let door = ["--select", "mechanism=HSI_kitchen_cabinet_right_charlie", "--split", split];
+        study.import(&table, "door_survey", &format!("{split}.mcap"), &door);
+    }
+    study.learn("fit.mcap", &[]);
+    let ladder = study.ladder("score.mcap");
+    let (last, parts) = ladder.last().unwrap();
+    assert!(has(last, "self_closing") && !has(last, "unknown"), "{ladder:?}");
+    assert!(parts[0].0 < 0.3 * ladder[0].1[0].0, "{ladder:?}");
 }

@@ -48,8 +48,12 @@ pub fn run(arguments: &ImportArguments) -> anyhow::Result<()> {
     };
     let table = Table::from_file(&arguments.table)?;
     let imported = import(table, &spec, split, &arguments.output)?;
+    let left_out = match imported.rows_empty {
+        0 => String::new(),
+        count => format!("; {count} left out for an empty cell"),
+    };
     print(&format!(
-        "{}: {} messages from {} readings ({} rows in {})\n",
+        "{}: {} messages from {} readings ({} rows in {}{left_out})\n",
         arguments.output.display(),
         imported.messages,
         imported.rows,

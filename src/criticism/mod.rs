@@ -13,7 +13,7 @@ mod signature;
 mod statistics;
 
 pub use numbers::{Addition, Numbers, Workshop};
-pub use selection::{Component, Selection, Selector};
+pub use selection::{Component, Selection, Selector, Step};
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -42,7 +42,7 @@ pub struct Critic {
     /// The joints that the last selection's numbers are about, and the numbers.
     known: Option<(Vec<Label>, Numbers)>,
     /// The models on the way to the last selection.
-    stages: Vec<BTreeSet<Addition>>,
+    stages: Vec<Step>,
 }
 
 /// A model on the way from the declared physics to what was selected, fitted to all windows.
@@ -94,7 +94,8 @@ impl Critic {
         let (selected, findings, scales) = {
             let workshop =
                 Workshop { learner, fit, input, rest_prior: rest_prior.clone(), sensor_scales: SENSOR_SCALES, spans };
-            let found = self.stages.last().filter(|_| known_joints).cloned().unwrap_or_default();
+            let found =
+                self.stages.last().filter(|_| known_joints).map(|step| step.additions.clone()).unwrap_or_default();
             let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref(), found: &found };
             let base = selector.base(&numbers)?;
             tracing::debug!(evidence = base.log_evidence, additions = ?base.additions, kappa = ?noise_scales(&base, &batch), "base");
@@ -120,6 +121,11 @@ impl Critic {
                 (base.clone(), before, selector.select(base)?)
             };
             let mut selected = selector.describe_leftover(selected)?;
+            // What explains most windows no better than noise would says nothing of what they lack.
+            let scales = noise_scales(&selected, batch).into_iter().map(|(_, scale)| scale).collect();
+            if crate::math::median(scales).is_some_and(|scale| scale >= OUTLYING.0) {
+                return Err(Failure::Diverged);
+            }
             let mut after = before.clone();
             if !selected.rivals.is_empty() {
                 match scores(&workshop, batch, &selected) {
@@ -198,8 +204,11 @@ impl Critic {
         let found = BTreeSet::new();
         let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref(), found: &found };
         let mut selections = vec![selector.base(&numbers)?];
-        for additions in &self.stages {
-            selections.push(selector.fitted(additions, &numbers, (12, 2))?);
+        for step in &self.stages {
+            // From where it was found and from where all ended.
+            let fits = [&step.numbers, &numbers].map(|start| selector.fitted(&step.additions, start, (12, 2)));
+            let best = fits.into_iter().flatten().max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence));
+            selections.push(best.ok_or(Failure::Diverged)?);
         }
         let stage = |selection: Selection| {
             let hypothesis = workshop.hypothesis(&selection.additions)?;

@@ -5,6 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::numbers::{Addition, Numbers, Workshop};
 use super::rest::RestReadings;
 use super::signature::{Probes, Ranked, probes, start_by_direction};
+use serde::{Deserialize, Serialize};
+
 use crate::inference::Failure;
 use crate::mechanism::effects::{EffectKind, TableKind};
 use crate::model::{BatchFit, BatchWindow, Hypothesis};
@@ -14,6 +16,8 @@ use crate::model::{BatchFit, BatchWindow, Hypothesis};
 const LEAST_GAIN: f64 = 6.0;
 /// The same for a table, which fits much.
 const LEAST_TABLE_GAIN: f64 = 10.0;
+/// What gains this from where it was found before is not tried anew as well.
+const CLEAR_GAIN: f64 = 50.0;
 /// How many of the ranked are refitted, and from how much first-order gain on \[nats\].
 const REFITTED: usize = 5;
 const WORTH_A_REFIT: f64 = 3.0;
@@ -30,13 +34,19 @@ const TABLES_TRIED: usize = 4;
 const HALT_S: f64 = 0.2;
 /// Rank of what was found before.
 const KNOWN: f64 = 1e9;
+/// κ that fits start from; the base model's from both, as a wrong model has more than one optimum.
+const FIRST_SCALES: [f64; 2] = [10.0, 1e3];
+/// Some candidates start with κ larger by this, too.
+const WIDENED: f64 = 30.0;
 /// A delay is tried from these \[scales\]: the motion's dependence on it is far from linear.
 const DELAYS: [f64; 4] = [-0.8, 0.3, 1.0, 2.0];
-/// A review ends at this many linearizations of a window beyond the base model's; one in which several
-/// joints move counts for the square of their number and as much again.
-const BUDGET: usize = 1500;
-/// The same where several joints move.
-const CHAIN_BUDGET: usize = 2500;
+/// A chain whose friction is to be found, as motors' is: they report their torques with little delay.
+const SHORT_DELAYS: [f64; 2] = [-0.1, 0.1];
+/// A review ends at this many linearizations of all windows beyond the base model's: more windows take longer,
+/// and do not leave less time for each candidate.
+const BUDGET: usize = 350;
+/// A model that was taken is fitted on at most so often, while that gains as much \[nats\].
+const SETTLING: (usize, f64) = (3, 1.0);
 /// Linearizations of a refit, and how often κ is chosen anew.
 const REFIT: (usize, usize) = (8, 2);
 /// Where several joints move, candidates are first fitted as little as this, and the best few refitted.
@@ -62,14 +72,23 @@ pub struct Selection {
     /// For every addition accepted: the log evidence of the model without it, and of those with
     /// another in its place.
     pub rivals: BTreeMap<Addition, Vec<(Option<Addition>, f64)>>,
-    /// The models on the way, by what they have beyond the declared physics.
-    pub stages: Vec<BTreeSet<Addition>>,
+    /// The models on the way.
+    pub stages: Vec<Step>,
     /// What was refitted last and gained too little, with its gain \[nats\].
     pub declined: Vec<(Addition, f64)>,
     /// What tables would gain over the model at first order \[nats\], most first.
     pub leftover: Vec<(Addition, f64)>,
     /// Linearizations of all windows spent.
     pub steps: usize,
+}
+
+/// A model on the way to the one selected.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub struct Step {
+    /// What it has beyond the declared physics.
+    pub additions: BTreeSet<Addition>,
+    /// Its numbers.
+    pub numbers: Numbers,
 }
 
 /// Joints whose windows hang together.
@@ -81,6 +100,12 @@ pub struct Component {
     pub windows: Vec<usize>,
     /// The fit of those.
     pub fitted: Option<BatchFit>,
+}
+
+impl Selection {
+    fn note_step(&mut self) {
+        self.stages.push(Step { additions: self.additions.clone(), numbers: self.numbers.clone() });
+    }
 }
 
 /// Joints that move in the same windows, or all that move if `together`.
@@ -132,7 +157,8 @@ struct Trial {
 }
 
 impl Selector<'_> {
-    /// What a linearization of these windows costs, in those of windows of one joint.
+    /// What a linearization of these windows costs, in those of windows of one joint; one in which several joints
+    /// move counts for the square of their number and as much again.
     fn weight(&self, windows: &[usize]) -> usize {
         let one = |w: &usize| match self.batch[*w].moving.len() {
             1 => 1,
@@ -152,6 +178,17 @@ impl Selector<'_> {
         numbers: &Numbers,
         effort: (usize, usize),
     ) -> Result<Selection, Failure> {
+        self.fitted_from(additions, numbers, FIRST_SCALES[0], effort)
+    }
+
+    /// The same with κ of all windows to start from.
+    fn fitted_from(
+        &self,
+        additions: &BTreeSet<Addition>,
+        numbers: &Numbers,
+        scale: f64,
+        effort: (usize, usize),
+    ) -> Result<Selection, Failure> {
         let together = additions.iter().any(|a| a.joint().is_none());
         let hypothesis = self.workshop.hypothesis(additions)?;
         let mut selection = Selection {
@@ -168,7 +205,7 @@ impl Selector<'_> {
         for component in &mut selection.components {
             let windows = self.windows(&component.windows);
             let x = selection.numbers.laid_out(&hypothesis, additions);
-            let scales = vec![10.0; windows.len()];
+            let scales = vec![scale; windows.len()];
             let fitted = hypothesis.fit(&windows, &x, &scales, effort)?;
             selection.numbers.take(&hypothesis, additions, &fitted.x, &component.joints);
             selection.log_evidence += fitted.log_evidence;
@@ -191,7 +228,7 @@ impl Selector<'_> {
         let mut bland = numbers.clone();
         bland.joints.clear();
         // The learner's numbers may be what a wrong model made of the windows.
-        for start in [numbers, &bland] {
+        for (start, scale) in FIRST_SCALES.into_iter().flat_map(|scale| [(numbers, scale), (&bland, scale)]) {
             let misfit = best.as_ref().is_none_or(|b| {
                 let fits = b.components.iter().filter_map(|c| c.fitted.as_ref());
                 fits.flat_map(|f| &f.windows).any(|w| w.reduction > 3.0 || w.noise_scale > 50.0)
@@ -199,13 +236,14 @@ impl Selector<'_> {
             if !misfit {
                 continue;
             }
-            if let Ok(fitted) = self.fitted(&BTreeSet::new(), start, (10, 2))
+            if let Ok(fitted) = self.fitted_from(&BTreeSet::new(), start, scale, (10, 2))
                 && best.as_ref().is_none_or(|b| fitted.log_evidence > b.log_evidence)
             {
                 best = Some(fitted);
             }
         }
         let mut current = best.ok_or(Failure::Diverged)?;
+        self.settle(&mut current)?;
         for component in current.components.clone() {
             for &joint in &component.joints {
                 let moved = component.windows.iter().any(|&w| self.batch[w].moving.contains(&joint));
@@ -244,6 +282,10 @@ impl Selector<'_> {
                 if current.steps > budget {
                     break;
                 }
+                let same = |trial: &Trial| trial.addition == candidate.addition && trial.also.is_empty();
+                if candidate.also.is_empty() && trials.iter().any(|trial| same(trial) && trial.gain > CLEAR_GAIN) {
+                    continue;
+                }
                 if let Ok(trial) = self.best_trial(&current, &candidate) {
                     current.steps += trial.spent;
                     tracing::debug!(addition = ?trial.addition, first_order = candidate.gain, gain = trial.gain, "trial");
@@ -274,7 +316,8 @@ impl Selector<'_> {
                 match self.pair(&current, best, friction_declared, least)? {
                     Some(pair) => {
                         current = pair;
-                        current.stages.push(current.additions.clone());
+                        self.settle(&mut current)?;
+                        current.note_step();
                     }
                     None => break,
                 }
@@ -290,8 +333,9 @@ impl Selector<'_> {
             self.take(&mut current, best);
             current.rivals.extend(best.also.iter().map(|other| (*other, vec![(None, -best.gain)])));
             current.rivals.insert(addition, rivals);
+            self.settle(&mut current)?;
             self.drop_what_is_not_needed(&mut current, addition)?;
-            current.stages.push(current.additions.clone());
+            current.note_step();
         }
         Ok(current)
     }
@@ -328,21 +372,47 @@ impl Selector<'_> {
         // The numbers of a model without it stand in for it, and hold it down: it starts from the prior's, too.
         let mut bland = current.clone();
         bland.numbers.joints.clear();
-        let starts: Vec<(&Selection, f64)> = match candidate.addition {
-            Addition::Delay => {
-                [current, &bland].into_iter().flat_map(|from| DELAYS.map(|delay| (from, delay))).collect()
+        let alone = |starts: Vec<(&'_ Selection, f64)>| -> Vec<_> {
+            starts
+                .into_iter()
+                .map(|(from, start)| (from.clone(), Ranked { start: vec![start], ..candidate.clone() }))
+                .collect()
+        };
+        // Friction on several joints, each by its own force, and a delay with it or none.
+        let friction = |joint: usize, share: f64| {
+            let force = self.workshop.learner.joint_scales(joint, self.workshop.fit).map_or(1.0, |s| s.force);
+            vec![(share * force).ln()]
+        };
+        let together = |from: &Selection, share: f64, start: Vec<f64>| {
+            let also = candidate.also.iter().map(|(other, _)| match other {
+                Addition::Friction(joint) => (*other, friction(*joint, share)),
+                _ => (*other, Vec::new()),
+            });
+            (from.clone(), Ranked { start, also: also.collect(), ..candidate.clone() })
+        };
+        let from_both = || [current, &bland].into_iter().zip(FRICTION_STARTS);
+        let starts: Vec<(Selection, Ranked)> = match candidate.addition {
+            Addition::Delay if candidate.also.is_empty() => {
+                let motors = self.several() && !self.workshop.learner.declared().friction;
+                let delays = if motors { [SHORT_DELAYS[0], SHORT_DELAYS[1], DELAYS[1], DELAYS[2]] } else { DELAYS };
+                alone([current, &bland].into_iter().flat_map(|from| delays.map(|delay| (from, delay))).collect())
             }
+            Addition::Delay => from_both()
+                .flat_map(|(from, share)| SHORT_DELAYS.map(|delay| together(from, share, vec![delay])))
+                .collect(),
             Addition::Friction(joint) => {
-                let force = self.workshop.learner.joint_scales(joint, self.workshop.fit).map_or(1.0, |s| s.force);
-                [current, &bland].into_iter().zip(FRICTION_STARTS.map(|share| (share * force).ln())).collect()
+                from_both().map(|(from, share)| together(from, share, friction(joint, share))).collect()
+            }
+            // Far from where friction and an offset are: with wide process noise the way there is smoother.
+            Addition::Effect(_, EffectKind::AsymmetricFriction) if !self.several() => {
+                [current.clone(), widened(current)].into_iter().map(|from| (from, candidate.clone())).collect()
             }
             _ => return self.trial(current, candidate, if self.several() { GLANCE } else { REFIT }),
         };
         let mut best: Option<Trial> = None;
         let mut spent = 0;
-        for (from, start) in starts {
-            let start = Ranked { start: vec![start], ..candidate.clone() };
-            let Ok(trial) = self.trial(from, &start, GLANCE) else { continue };
+        for (from, start) in &starts {
+            let Ok(trial) = self.trial(from, start, GLANCE) else { continue };
             spent += trial.spent;
             if best.as_ref().is_none_or(|other| trial.gain > other.gain) {
                 best = Some(trial);
@@ -361,7 +431,7 @@ impl Selector<'_> {
     }
 
     fn budget(&self) -> usize {
-        if self.several() { CHAIN_BUDGET } else { BUDGET }
+        BUDGET * self.weight(&(0..self.batch.len()).collect::<Vec<usize>>())
     }
 
     /// Fits a trial on from where it is; returns what that cost.
@@ -391,8 +461,10 @@ impl Selector<'_> {
             for (k, q) in path.iter().enumerate() {
                 if farthest.is_none_or(|(other, _)| sign * q > other) {
                     let time_s = window.times_s[k];
-                    let about = |i: &usize| (window.times_s[*i] - time_s).abs() <= HALT_S;
-                    let ends = k == 0 || k + 1 == path.len();
+                    let near_to = |other: f64| (other - time_s).abs() <= HALT_S;
+                    let about = |i: &usize| near_to(window.times_s[*i]);
+                    // Noise makes any of the last samples the farthest.
+                    let ends = near_to(window.times_s[0]) || near_to(window.times_s[path.len() - 1]);
                     let moves = (0..path.len()).filter(about).any(|i| (path[i] - q).abs() > near);
                     farthest = Some((sign * q, !(ends && moves)));
                 }
@@ -448,8 +520,14 @@ impl Selector<'_> {
         let mut frictions: Vec<Addition> = ranked.iter().filter(joint_of).map(|c| c.addition).collect();
         frictions.sort_unstable();
         frictions.dedup();
-        if let Some((addition, also)) = frictions.split_first().filter(|(_, also)| !also.is_empty()) {
-            ranked.push(Ranked { addition: *addition, gain: KNOWN, start: Vec::new(), also: also.to_vec() });
+        if let Some((addition, others)) = frictions.split_first().filter(|(_, others)| !others.is_empty()) {
+            let with = |others: &[Addition]| others.iter().map(|other| (*other, Vec::new())).collect::<Vec<_>>();
+            ranked.push(Ranked { addition: *addition, gain: KNOWN, start: Vec::new(), also: with(others) });
+            // Motors' torques that act late hide the friction of a chain.
+            if self.several() && !current.additions.contains(&Addition::Delay) {
+                let also = with(&frictions);
+                ranked.push(Ranked { addition: Addition::Delay, gain: KNOWN, start: Vec::new(), also });
+            }
         }
         // What was found before is tried from where it was, and anew.
         leftover.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
@@ -492,7 +570,16 @@ impl Selector<'_> {
         let addition = candidate.addition;
         let mut additions = current.additions.clone();
         additions.insert(addition);
-        additions.extend(&candidate.also);
+        additions.extend(candidate.also.iter().map(|(other, _)| *other));
+        // What differs by direction has friction and an offset in it, and stands in their place.
+        let mut replaced_offset = None;
+        if let Addition::Effect(joint, EffectKind::AsymmetricFriction) = addition {
+            additions.remove(&Addition::Friction(joint));
+            let offset = Addition::Effect(joint, EffectKind::GravityOffset);
+            if additions.remove(&offset) {
+                replaced_offset = current.numbers.added.get(&offset).and_then(|theta| theta.first().copied());
+            }
+        }
         // What pulls towards the closed position leans on its stop, which shows only now.
         let stop = self.closed_stop(addition).filter(|stop| additions.insert(*stop));
         let hypothesis = self.workshop.hypothesis(&additions)?;
@@ -502,20 +589,28 @@ impl Selector<'_> {
             && let Some(effect) = hypothesis.mechanism.joints[joint].effects.last()
             && !numbers.joints.is_empty()
             && !start.is_empty()
+            && candidate.gain < KNOWN
         {
-            start = start_by_direction(&numbers.joints[joint], &start, kind, &effect.scales);
+            let offset = replaced_offset.map(|theta| {
+                let law = &EffectKind::GravityOffset.parameters()[0];
+                law.physical(theta, &effect.scales)
+            });
+            start = start_by_direction(&numbers.joints[joint], &start, offset, kind, &effect.scales);
         }
-        for other in &candidate.also {
-            numbers.added.insert(*other, start.clone());
-        }
+        numbers.added.extend(candidate.also.iter().cloned());
         numbers.added.insert(addition, start);
         if let Some(Addition::Stop(joint, upper)) = stop {
             let (low, high) = self.workshop.range(joint);
             numbers.added.insert(Addition::Stop(joint, upper), vec![if upper { high } else { low }]);
         }
         let x = numbers.laid_out(&hypothesis, &additions);
+        let of_also = candidate.also.iter().filter_map(|(other, _)| other.joint());
+        let touched: Vec<usize> = addition.joint().into_iter().chain(of_also).collect();
         let concerned: Vec<&Component> = match addition.joint() {
-            Some(joint) => current.components.iter().filter(|c| c.joints.contains(&joint)).collect(),
+            Some(_) => {
+                let touches = |c: &&Component| c.joints.iter().any(|joint| touched.contains(joint));
+                current.components.iter().filter(touches).collect()
+            }
             None => current.components.iter().collect(),
         };
         let mut places: Vec<usize> = concerned.iter().flat_map(|c| c.windows.iter().copied()).collect();
@@ -531,7 +626,8 @@ impl Selector<'_> {
         let fitted = hypothesis.fit(&self.windows(&places), &x, &scales, effort)?;
         let rest = self.sensor_evidence(&additions) - self.sensor_evidence(&current.additions);
         let gain = fitted.log_evidence - before + rest;
-        let (also, spent) = (candidate.also.clone(), fitted.steps * self.weight(&places));
+        let also = candidate.also.iter().map(|(other, _)| *other).collect();
+        let spent = fitted.steps * self.weight(&places);
         Ok(Trial { addition, also, additions, gain, spent, hypothesis, fits: vec![(places, fitted)] })
     }
 
@@ -560,8 +656,34 @@ impl Selector<'_> {
         new.then_some(Addition::Stop(joint, upper))
     }
 
+    /// Fits a model on until that gains nothing more: else whatever is added next gains what was left to find
+    /// without it.
+    fn settle(&self, current: &mut Selection) -> Result<(), Failure> {
+        let hypothesis = self.workshop.hypothesis(&current.additions)?;
+        for component in &mut current.components {
+            let windows: Vec<&BatchWindow> = component.windows.iter().map(|&w| &self.batch[w]).collect();
+            for _ in 0..SETTLING.0 {
+                let Some(fitted) = &component.fitted else { break };
+                let scales: Vec<f64> = fitted.windows.iter().map(|window| window.noise_scale).collect();
+                let refitted = hypothesis.fit(&windows, &fitted.x, &scales, REFIT)?;
+                current.steps += refitted.steps * self.weight(&component.windows);
+                let gain = refitted.log_evidence - fitted.log_evidence;
+                if gain > 0.0 {
+                    current.numbers.take(&hypothesis, &current.additions, &refitted.x, &component.joints);
+                    current.log_evidence += gain;
+                    component.fitted = Some(refitted);
+                }
+                if gain < SETTLING.1 {
+                    break;
+                }
+            }
+        }
+        Ok(())
+    }
+
     fn take(&self, current: &mut Selection, trial: &Trial) {
         current.additions.clone_from(&trial.additions);
+        current.rivals.retain(|addition, _| trial.additions.contains(addition));
         for (places, fitted) in &trial.fits {
             let together = current.additions.iter().any(|a| a.joint().is_none());
             if together {
@@ -607,16 +729,6 @@ impl Selector<'_> {
         {
             let mut fewer = current.additions.clone();
             fewer.remove(&addition);
-            if let (Addition::Friction(joint), Addition::Effect(other, EffectKind::AsymmetricFriction)) =
-                (addition, newest)
-                && joint == other
-            {
-                // It stands in its place: nothing depends on it any more.
-                current.additions = fewer;
-                current.rivals.remove(&addition);
-                self.lay_out(current);
-                continue;
-            }
             let without = self.fitted(&fewer, &current.numbers, (6, 1))?;
             current.steps += without.steps;
             tracing::debug!(?addition, loss = current.log_evidence - without.log_evidence, "without");
@@ -692,10 +804,21 @@ impl Selector<'_> {
             self.take(&mut current, &trial);
             current.rivals.insert(addition, vec![(None, -trial.gain)]);
             self.drop_what_is_not_needed(&mut current, addition)?;
-            current.stages.push(current.additions.clone());
+            current.note_step();
         }
         Ok(current)
     }
+}
+
+/// The same with larger κ.
+fn widened(selection: &Selection) -> Selection {
+    let mut wide = selection.clone();
+    for fitted in wide.components.iter_mut().filter_map(|component| component.fitted.as_mut()) {
+        for window in &mut fitted.windows {
+            window.noise_scale *= WIDENED;
+        }
+    }
+    wide
 }
 
 /// Whether a window that moves a joint needs far more process noise than the sensor explains.

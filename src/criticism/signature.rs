@@ -28,8 +28,9 @@ pub struct Ranked {
     pub gain: f64,
     /// Its numbers to start a fit from.
     pub start: Vec<f64>,
-    /// What comes with it: friction on the other joints, where it is declared on none.
-    pub also: Vec<Addition>,
+    /// What comes with it, with the numbers to start from: friction on other joints, where it is declared on
+    /// none.
+    pub also: Vec<(Addition, Vec<f64>)>,
 }
 
 /// Normal equations of probes on one joint, or of the sensor's errors, the model eliminated.
@@ -441,12 +442,19 @@ impl Probes {
     }
 }
 
-/// Numbers of a joint that asymmetric friction starts from, given the declared ones.
-pub fn start_by_direction(declared: &[f64], start: &[f64], kind: EffectKind, scales: &Scales) -> Vec<f64> {
+/// Numbers of a joint that asymmetric friction starts from, given the declared ones: with the `offset` that it
+/// takes the place of, or what its signature suggests \[N or N·m\].
+pub fn start_by_direction(
+    declared: &[f64],
+    start: &[f64],
+    offset: Option<f64>,
+    kind: EffectKind,
+    scales: &Scales,
+) -> Vec<f64> {
     let parameters = kind.parameters();
     let (friction, damping) = (declared[crate::model::FRICTION].exp(), declared[crate::model::DAMPING].exp());
     let physical: Vec<f64> = parameters.iter().zip(start).map(|(p, theta)| p.physical(*theta, scales)).collect();
-    let half = 0.5 * (physical[1] - physical[0]);
+    let half = offset.unwrap_or(0.5 * (physical[1] - physical[0]));
     let values = [(friction - half).max(0.1 * friction), (friction + half).max(0.1 * friction), damping, damping];
     debug_assert!(declared.len() >= SIZE);
     let thetas = parameters.iter().zip(values);

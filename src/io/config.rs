@@ -174,6 +174,7 @@ impl Config {
             ("kinematics.steps", self.kinematics.steps as f64),
         ];
         positive.into_iter().try_for_each(|(key, value)| positive_number(key, value))?;
+        self.model.inertia.values().try_for_each(|value| positive_number("model.inertia", *value))?;
         for (key, value) in [("posterior_latency_s", self.posterior_latency_s), ("windows.lead_s", self.windows.lead_s)]
         {
             if !(0.0..=1e6).contains(&value) {
@@ -499,6 +500,7 @@ mod tests {
             ("input: {wrenches: [{part: -1}]}", "key `input.wrenches[0].part`: invalid type: integer `-1`"),
             ("input: {tf_timeout_s: -1}", "key `input.tf_timeout_s`: -1, expected above 0"),
             ("input: {tf_timeout_s: .nan}", "key `input.tf_timeout_s`: NaN, expected above 0"),
+            ("model: {inertia: {1: 0}}", "key `model.inertia`: 0, expected above 0"),
             ("input: {poses: parts/pose}", "key `input.poses`: `parts/pose`, expected {label}"),
             ("input: {part_wrenches: wrenches}", "key `input.part_wrenches`: `wrenches`, expected {label}"),
             ("input: {clouds: [wrench]}", "key `input`: topic /wrench is given twice"),

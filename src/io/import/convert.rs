@@ -34,6 +34,8 @@ pub struct Imported {
     pub rows: usize,
     /// Of so many.
     pub rows_in: usize,
+    /// Rows, or readings of a sweep, that are left out for an empty cell.
+    pub rows_empty: usize,
     /// Messages written.
     pub messages: usize,
 }
@@ -55,9 +57,10 @@ pub fn import(table: Table, spec: &ImportSpec, split: Option<&SplitSpec>, bag: &
             (table, runs)
         }
     };
-    let times_s = times(&table, spec, &runs)?;
-    let keep = kept(&times_s, &runs, split);
     let machine = Machine::new(&table, spec)?;
+    let times_s = times(&table, spec, &runs)?;
+    let first_s = times_s.iter().flatten().next().copied().unwrap_or(0.0);
+    let keep = kept(&times_s, &runs, split);
     let fail = |error: &dyn ToString| ImportError::file(bag, error.to_string());
     let folder = bag.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     // It appears when it is complete.
@@ -65,9 +68,14 @@ pub fn import(table: Table, spec: &ImportSpec, split: Option<&SplitSpec>, bag: &
     let mut writer = Messages::new(BagWriter::create(aside.path()).map_err(|e| fail(&e))?);
     let mut imported = Imported { rows_in, ..Imported::default() };
     for (row, time_s) in times_s.iter().enumerate() {
+        // Nothing was measured: a guess in its place would be taken for a measurement.
+        let Some(time_s) = time_s.filter(|_| !machine.lacks(&table, row)) else {
+            imported.rows_empty += 1;
+            continue;
+        };
         let instant = machine.at(&table, row)?;
         if keep[row] {
-            let stamp = Stamp(FIRST_STAMP).plus_seconds(time_s - times_s[0]);
+            let stamp = Stamp(FIRST_STAMP).plus_seconds(time_s - first_s);
             writer.write(stamp, &instant).map_err(|e| fail(&e))?;
             imported.rows += 1;
         }
@@ -81,28 +89,36 @@ pub fn import(table: Table, spec: &ImportSpec, split: Option<&SplitSpec>, bag: &
     Ok(imported)
 }
 
-fn times(table: &Table, spec: &ImportSpec, runs: &[usize]) -> Result<Vec<f64>, ImportError> {
+/// When each row was recorded \[s\]; none where its cell is empty.
+fn times(table: &Table, spec: &ImportSpec, runs: &[usize]) -> Result<Vec<Option<f64>>, ImportError> {
     let pause_s = spec.sweep.as_ref().map_or(0.0, |sweep| sweep.pause_s);
     let Some(column) = &spec.time.column else {
         let rate_hz = spec.time.rate_hz.unwrap_or(1.0);
-        let time = |(row, run): (usize, &usize)| row as f64 / rate_hz + *run as f64 * pause_s;
+        let time = |(row, run): (usize, &usize)| Some(row as f64 / rate_hz + *run as f64 * pause_s);
         return Ok(runs.iter().enumerate().map(time).collect());
     };
     let column = table.column(column)?;
-    let mut times_s: Vec<f64> = Vec::with_capacity(table.len());
+    let mut times_s: Vec<Option<f64>> = Vec::with_capacity(table.len());
+    let mut last: Option<f64> = None;
     for row in 0..table.len() {
+        if table.is_empty_at(row, &column) {
+            times_s.push(None);
+            continue;
+        }
         let time_s = table.value(row, &column)?;
-        if let Some(before) = times_s.last().filter(|before| **before >= time_s) {
+        if let Some(before) = last.filter(|before| *before >= time_s) {
             return Err(table.bad(row, &column, format!("{time_s} s after {before} s, expected a later time")));
         }
-        times_s.push(time_s);
+        last = Some(time_s);
+        times_s.push(last);
     }
     Ok(times_s)
 }
 
 /// Which rows are in a split.
-fn kept(times_s: &[f64], runs: &[usize], split: Option<&SplitSpec>) -> Vec<bool> {
-    let (first, last) = (times_s.first().copied().unwrap_or(0.0), times_s.last().copied().unwrap_or(0.0));
+fn kept(times_s: &[Option<f64>], runs: &[usize], split: Option<&SplitSpec>) -> Vec<bool> {
+    let first = times_s.iter().flatten().next().copied().unwrap_or(0.0);
+    let last = times_s.iter().flatten().last().copied().unwrap_or(0.0);
     let inside = |time_s: f64, run: usize| {
         let Some(split) = split else { return true };
         if let Some([from, to]) = split.share {
@@ -116,7 +132,7 @@ fn kept(times_s: &[f64], runs: &[usize], split: Option<&SplitSpec>) -> Vec<bool>
         let block = ((time_s - first) / block_s).floor() as u64;
         blocks.contains(&((block % u64::from(of)) as u32))
     };
-    times_s.iter().zip(runs).map(|(time_s, run)| inside(*time_s, *run)).collect()
+    times_s.iter().zip(runs).map(|(time_s, run)| time_s.is_some_and(|time_s| inside(time_s, *run))).collect()
 }
 
 /// A part in one row, in world.
@@ -190,6 +206,21 @@ impl<'a> Machine<'a> {
             parts: parts.collect::<Result<_, ImportError>>()?,
             wrenches: wrenches.collect::<Result<_, ImportError>>()?,
         })
+    }
+
+    /// Whether a cell that is read of a row is empty.
+    fn lacks(&self, table: &Table, row: usize) -> bool {
+        let empty = |columns: &[Column]| columns.iter().any(|column| table.is_empty_at(row, column));
+        let triple = |columns: &Option<[Column; 3]>| columns.as_ref().is_some_and(|columns| empty(columns));
+        let single = |column: &Option<Column>| column.as_ref().is_some_and(|column| table.is_empty_at(row, column));
+        let of_part = |part: &PartColumns<'_>| {
+            single(&part.joint)
+                || triple(&part.position)
+                || part.orientation.as_ref().is_some_and(|columns| empty(columns))
+        };
+        let of_wrench =
+            |wrench: &WrenchColumns<'_>| triple(&wrench.force) || triple(&wrench.torque) || single(&wrench.effort);
+        self.parts.iter().any(of_part) || self.wrenches.iter().any(of_wrench)
     }
 
     fn at(&self, table: &Table, row: usize) -> Result<Instant, ImportError> {

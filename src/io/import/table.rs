@@ -90,6 +90,11 @@ impl Table {
         Ok(column.gain * number + column.offset)
     }
 
+    /// Whether a row has nothing in a column.
+    pub(super) fn is_empty_at(&self, row: usize, column: &Column) -> bool {
+        self.rows[row].cells.get(column.index).is_none_or(String::is_empty)
+    }
+
     /// An error about one value.
     pub(super) fn bad(&self, row: usize, column: &Column, reason: String) -> ImportError {
         let name = self.names.get(column.index).cloned().unwrap_or_default();

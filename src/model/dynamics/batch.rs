@@ -55,8 +55,6 @@ pub struct BatchedWindow {
     pub observations: usize,
     /// Entries of all numbers that it depends on.
     pub active: Vec<usize>,
-    /// Jᵀ r and Jᵀ J.
-    pub normal: (DVector<f64>, DMatrix<f64>),
     /// Variance and correlation of the innovations beyond what they should be.
     pub reduction: f64,
 }
@@ -130,8 +128,17 @@ impl Hypothesis {
         let mut scales = scales.to_vec();
         let mut x = x.to_vec();
         let mut spent = 0;
-        let mut problem =
-            Problem { hypothesis: self, windows, by_window, places, active, x, scales, latest: Vec::new() };
+        let mut problem = Problem {
+            hypothesis: self,
+            windows,
+            by_window,
+            places,
+            active,
+            x,
+            scales,
+            latest: Vec::new(),
+            kept: Vec::new(),
+        };
         for round in 0..=rounds {
             let start = DVector::from_iterator(problem.active.len(), problem.active.iter().map(|&i| problem.x[i]));
             let settings = SolverSettings { steps, keeps_last_linearization: true, ..SolverSettings::default() };
@@ -153,13 +160,11 @@ impl Hypothesis {
             let covariance = hessian.cholesky().ok_or(Failure::Singular)?.inverse();
             let batched = problem.latest.iter().enumerate().map(|(w, innovations)| {
                 let own = &problem.by_window[w];
-                let (curvature, gradient) = normal_equations(innovations, own.len());
                 BatchedWindow {
                     noise_scale: scales[w],
                     log_likelihood: -innovations.cost() - innovations.half_log_determinant - scale_cost(scales[w]),
                     observations: innovations.whitened.len(),
                     active: own.clone(),
-                    normal: (gradient, curvature),
                     reduction: reduction(&innovations.whitened, windows[w].moving.len()),
                 }
             });
@@ -186,6 +191,7 @@ struct Problem<'a> {
     x: Vec<f64>,
     scales: Vec<f64>,
     latest: Vec<Innovations>,
+    kept: Vec<Innovations>,
 }
 
 impl Problem<'_> {
@@ -195,33 +201,23 @@ impl Problem<'_> {
         }
     }
 
-    /// κ of the greatest likelihood by window, by ascent from the last.
+    /// κ of the greatest likelihood by window; far off it may have several tops.
     fn choose_scales(&self) -> Result<Vec<f64>, Failure> {
         let choose = |w: usize| {
             let of = |innovations: &Innovations, scale: f64| {
                 -innovations.cost() - innovations.half_log_determinant - scale_cost(scale)
             };
-            let density = |at: usize| {
+            let density = |scale: f64| {
                 // What was fitted last was fitted with this one.
-                if let Some(latest) = self.latest.get(w).filter(|_| NOISE_SCALES[at] == self.scales[w]) {
-                    return Ok(of(latest, self.scales[w]));
+                if let Some(latest) = self.latest.get(w).filter(|_| scale == self.scales[w]) {
+                    return Ok(of(latest, scale));
                 }
-                let model = self.hypothesis.window(self.windows[w], NOISE_SCALES[at]);
-                Ok::<_, Failure>(of(&model.linearize(&self.x, &[])?, NOISE_SCALES[at]))
+                let model = self.hypothesis.window(self.windows[w], scale);
+                Ok::<_, Failure>(of(&model.linearize(&self.x, &[])?, scale))
             };
-            let mut at = NOISE_SCALES.iter().position(|s| *s >= self.scales[w]).unwrap_or(0);
-            let mut best = density(at)?;
-            for direction in [1, -1_isize] {
-                while let Some(next) = at.checked_add_signed(direction).filter(|i| *i < NOISE_SCALES.len()) {
-                    let trial = density(next)?;
-                    if trial <= best {
-                        break;
-                    }
-                    best = trial;
-                    at = next;
-                }
-            }
-            Ok(NOISE_SCALES[at])
+            let densities = NOISE_SCALES.into_iter().filter_map(|scale| Some((scale, density(scale).ok()?)));
+            let best = densities.max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.total_cmp(&a.0)));
+            best.map(|(scale, _)| scale).ok_or(Failure::Diverged)
         };
         (0..self.windows.len()).into_par_iter().map(choose).collect()
     }
@@ -259,5 +255,17 @@ impl LeastSquares for Problem<'_> {
         };
         let all: Vec<f64> = (0..self.windows.len()).into_par_iter().map(one).collect::<Result<_, Failure>>()?;
         Ok(all.iter().sum())
+    }
+
+    fn cost_of_weights(&self) -> Option<f64> {
+        Some(self.latest.iter().map(|innovations| innovations.half_log_determinant).sum())
+    }
+
+    fn keep(&mut self) {
+        self.kept.clone_from(&self.latest);
+    }
+
+    fn restore(&mut self) {
+        std::mem::swap(&mut self.latest, &mut self.kept);
     }
 }

@@ -191,7 +191,8 @@ impl WindowModel<'_> {
             if k > 0 {
                 let span = [observations[k - 1].time_s, observation.time_s];
                 let before = state.rows(0, 2 * n).into_owned();
-                let (next, derivatives) = self.advance_with_slopes(&slopes, &before, span, p)?;
+                let spread = spread_of(&covariance, n);
+                let (next, derivatives) = self.advance_with_slopes(&slopes, &before, &spread, span, p)?;
                 state.rows_mut(0, 2 * n).copy_from(&next);
                 let at = derivatives.ncols() - 2 * n;
                 let mut transition = DMatrix::identity(size, size);
@@ -296,7 +297,8 @@ impl WindowModel<'_> {
             if let (Some(from_s), Some(last)) = (before_s, steps.last()) {
                 let span = [from_s, observation.time_s];
                 let moved = last.updated.rows(0, 2 * n).into_owned();
-                let (next, derivatives) = self.advance_with_slopes(&slopes, &moved, span, 0)?;
+                let spread = spread_of(&last.updated_covariance, n);
+                let (next, derivatives) = self.advance_with_slopes(&slopes, &moved, &spread, span, 0)?;
                 predicted.copy_from(&last.updated);
                 predicted.rows_mut(0, 2 * n).copy_from(&next);
                 transition.view_mut((0, 0), (2 * n, 2 * n)).copy_from(&derivatives.columns(0, 2 * n));
@@ -411,11 +413,12 @@ impl WindowModel<'_> {
     }
 
     /// The state after a span, and its derivatives: by parameters where they come with the simulation, then
-    /// by the state before.
+    /// by the state before, whose rates have the standard deviations `spread`.
     fn advance_with_slopes(
         &self,
         slopes: &Slopes,
         state: &DVector<f64>,
+        spread: &[f64],
         span: [f64; 2],
         p: usize,
     ) -> Result<(DVector<f64>, DMatrix<f64>), Failure> {
@@ -424,11 +427,21 @@ impl WindowModel<'_> {
             Slopes::Differences(plant, _) => {
                 let after = DVector::from_vec(self.advance(plant, state.as_slice(), span)?);
                 let mut derivatives = DMatrix::zeros(state.len(), state.len());
-                for i in 0..state.len() {
+                let n = spread.len();
+                let moved = |i: usize, by: f64| {
                     let mut start = state.clone();
-                    start[i] += DIFFERENCE;
-                    let end = DVector::from_vec(self.advance(plant, start.as_slice(), span)?);
-                    derivatives.set_column(i, &((end - &after) / DIFFERENCE));
+                    start[i] += by;
+                    Ok::<_, Failure>(DVector::from_vec(self.advance(plant, start.as_slice(), span)?))
+                };
+                for i in 0..n {
+                    derivatives.set_column(i, &((moved(i, DIFFERENCE)? - &after) / DIFFERENCE));
+                }
+                // A joint that sticks forgets its rate, but not if it may well be moving: differences over
+                // what the rate may be (Norgaard, Poulsen, Ravn, Automatica 36, 2000).
+                for (i, spread) in spread.iter().enumerate() {
+                    let by = spread.max(DIFFERENCE);
+                    let slope = (moved(n + i, by)? - moved(n + i, -by)?) / (2.0 * by);
+                    derivatives.set_column(n + i, &slope);
                 }
                 return Ok((after, derivatives));
             }
@@ -614,6 +627,11 @@ fn state_rows(observation: &Observation) -> DMatrix<f64> {
     rows.columns_mut(0, n).copy_from(&observation.rows);
     rows.columns_mut(2 * n, CONTACT).copy_from(&observation.contact_rows);
     rows
+}
+
+/// Standard deviations of the rates.
+fn spread_of(covariance: &DMatrix<f64>, n: usize) -> Vec<f64> {
+    (n..2 * n).map(|i| covariance[(i, i)].max(0.0).sqrt()).collect()
 }
 
 /// The samples needed between two times.

@@ -6,8 +6,8 @@ use nalgebra::{DMatrix, DVector, Matrix2, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::layout::{
-    AddedEffect, AddedTable, CenterFrame, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism, SENSOR_SIZE,
-    SIZE, SensorModel, TILT, TiltFrame, UPPER, joint_models,
+    AddedEffect, AddedTable, CenterFrame, INERTIA, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism,
+    SENSOR_SIZE, SIZE, SensorModel, TILT, TiltFrame, UPPER, joint_models,
 };
 use super::site::{FittedWindow, WindowFit, inertial_entries, load_factor};
 use super::track::{Drive, TrackKinematics, TrackSource, driven_labels, joint_track, touched_label};
@@ -38,6 +38,8 @@ const TYPICAL_RECORD_S: f64 = 4.0;
 /// A stop is believed if it raises the log evidence by this.
 const STOP_EVIDENCE: f64 = 4.0;
 
+/// Standard deviation of the logarithm of an inertia that was declared.
+const DECLARED_INERTIA: f64 = 0.02;
 /// A joint whose axis has turned by more than 10° since it was first learned is another: what windows said of it
 /// goes by where that axis was.
 const SAME_DIRECTION: f64 = 0.985;
@@ -166,13 +168,15 @@ pub struct DeclaredPhysics {
     pub friction: bool,
     /// Effects by name.
     pub effects: Vec<EffectKind>,
+    /// Inertia about its joint, or mass on its slide, of parts of which it is known \[kg m² or kg\].
+    pub inertia: BTreeMap<Label, f64>,
     /// Whether criticism may add others.
     pub criticism: bool,
 }
 
 impl Default for DeclaredPhysics {
     fn default() -> Self {
-        Self { friction: true, effects: Vec::new(), criticism: true }
+        Self { friction: true, effects: Vec::new(), inertia: BTreeMap::new(), criticism: true }
     }
 }
 
@@ -377,7 +381,15 @@ impl DynamicsLearner {
             let gaussian = match self.belief.prior(&block) {
                 Some(old) if old.gaussian.dimension() == model.size() => with_stops(&old.gaussian, memory),
                 Some(old) => extended(&with_stops(&old.gaussian, memory), model)?,
-                None => model.prior(memory.stop_positions)?,
+                None => {
+                    let mut prior = model.prior(memory.stop_positions)?;
+                    if let Some(inertia) = self.declared.inertia.get(&label) {
+                        let precision = DECLARED_INERTIA.powi(-2);
+                        prior.precision[(INERTIA, INERTIA)] += precision;
+                        prior.information[INERTIA] += precision * inertia.ln();
+                    }
+                    prior
+                }
             };
             let gaussian = with_tilt(gaussian, model, fit);
             let size = model.size();
