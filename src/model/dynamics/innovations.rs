@@ -192,12 +192,13 @@ impl WindowModel<'_> {
                 let span = [observations[k - 1].time_s, observation.time_s];
                 let before = state.rows(0, 2 * n).into_owned();
                 let spread = spread_of(&covariance, n);
-                let (next, derivatives) = self.advance_with_slopes(&slopes, &before, &spread, span, p)?;
+                let (next, derivatives) = self.advance_with_slopes(&slopes, &before, span, p)?;
                 state.rows_mut(0, 2 * n).copy_from(&next);
                 let at = derivatives.ncols() - 2 * n;
                 let mut transition = DMatrix::identity(size, size);
                 transition.view_mut((0, 0), (2 * n, 2 * n)).copy_from(&derivatives.columns(at, 2 * n));
-                covariance = &transition * covariance * transition.transpose();
+                let carried = self.over_spread(&slopes, transition.clone(), &before, &spread, span)?;
+                covariance = &carried * covariance * carried.transpose();
                 let mut own = covariance.view_mut((0, 0), (2 * n, 2 * n));
                 own += noise.over(span, &self.all_positions(state.as_slice()), self)?;
                 advance = Some(Advance { span, before, after: next, transition, derivatives });
@@ -298,10 +299,11 @@ impl WindowModel<'_> {
                 let span = [from_s, observation.time_s];
                 let moved = last.updated.rows(0, 2 * n).into_owned();
                 let spread = spread_of(&last.updated_covariance, n);
-                let (next, derivatives) = self.advance_with_slopes(&slopes, &moved, &spread, span, 0)?;
+                let (next, derivatives) = self.advance_with_slopes(&slopes, &moved, span, 0)?;
                 predicted.copy_from(&last.updated);
                 predicted.rows_mut(0, 2 * n).copy_from(&next);
                 transition.view_mut((0, 0), (2 * n, 2 * n)).copy_from(&derivatives.columns(0, 2 * n));
+                transition = self.over_spread(&slopes, transition, &moved, &spread, span)?;
                 covariance = &transition * &last.updated_covariance * transition.transpose();
                 let mut own = covariance.view_mut((0, 0), (2 * n, 2 * n));
                 own += noise.over(span, &self.all_positions(predicted.as_slice()), self)?;
@@ -413,12 +415,11 @@ impl WindowModel<'_> {
     }
 
     /// The state after a span, and its derivatives: by parameters where they come with the simulation, then
-    /// by the state before, whose rates have the standard deviations `spread`.
+    /// by the state before.
     fn advance_with_slopes(
         &self,
         slopes: &Slopes,
         state: &DVector<f64>,
-        spread: &[f64],
         span: [f64; 2],
         p: usize,
     ) -> Result<(DVector<f64>, DMatrix<f64>), Failure> {
@@ -427,21 +428,9 @@ impl WindowModel<'_> {
             Slopes::Differences(plant, _) => {
                 let after = DVector::from_vec(self.advance(plant, state.as_slice(), span)?);
                 let mut derivatives = DMatrix::zeros(state.len(), state.len());
-                let n = spread.len();
-                let moved = |i: usize, by: f64| {
-                    let mut start = state.clone();
-                    start[i] += by;
-                    Ok::<_, Failure>(DVector::from_vec(self.advance(plant, start.as_slice(), span)?))
-                };
-                for i in 0..n {
-                    derivatives.set_column(i, &((moved(i, DIFFERENCE)? - &after) / DIFFERENCE));
-                }
-                // A joint that sticks forgets its rate, but not if it may well be moving: differences over
-                // what the rate may be (Norgaard, Poulsen, Ravn, Automatica 36, 2000).
-                for (i, spread) in spread.iter().enumerate() {
-                    let by = spread.max(DIFFERENCE);
-                    let slope = (moved(n + i, by)? - moved(n + i, -by)?) / (2.0 * by);
-                    derivatives.set_column(n + i, &slope);
+                for i in 0..state.len() {
+                    let end = self.advance_moved(plant, state, (i, DIFFERENCE), span)?;
+                    derivatives.set_column(i, &((end - &after) / DIFFERENCE));
                 }
                 return Ok((after, derivatives));
             }
@@ -465,6 +454,41 @@ impl WindowModel<'_> {
         forward.four.iter().try_for_each(|chunk| self.pass(chunk, state, &mut passage))?;
         forward.two.iter().try_for_each(|chunk| self.pass(chunk, state, &mut passage))?;
         Ok((passage.after, passage.derivatives))
+    }
+
+    /// The transition of a covariance whose rates have the standard deviations `spread`: a joint of a chain that
+    /// sticks forgets its rate, but not if it may well be moving, so that differences are taken over what the
+    /// rate may be (Norgaard, Poulsen, Ravn, Automatica 36, 2000).
+    fn over_spread(
+        &self,
+        slopes: &Slopes,
+        mut transition: DMatrix<f64>,
+        state: &DVector<f64>,
+        spread: &[f64],
+        span: [f64; 2],
+    ) -> Result<DMatrix<f64>, Failure> {
+        let Slopes::Differences(plant, _) = slopes else { return Ok(transition) };
+        for (i, deviation) in spread.iter().enumerate() {
+            let (rate, by) = (spread.len() + i, deviation.max(DIFFERENCE));
+            let ends = [by, -by].map(|by| self.advance_moved(plant, state, (rate, by), span));
+            let [after, before] = ends;
+            let slope = (after? - before?) / (2.0 * by);
+            transition.view_mut((0, rate), (state.len(), 1)).copy_from(&slope);
+        }
+        Ok(transition)
+    }
+
+    /// The state after a span from one that is moved in one of its entries.
+    fn advance_moved(
+        &self,
+        plant: &Plant<f64>,
+        state: &DVector<f64>,
+        (entry, by): (usize, f64),
+        span: [f64; 2],
+    ) -> Result<DVector<f64>, Failure> {
+        let mut start = state.clone();
+        start[entry] += by;
+        Ok(DVector::from_vec(self.advance(plant, start.as_slice(), span)?))
     }
 
     /// Carries a chunk's derivatives through a span.
