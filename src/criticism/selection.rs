@@ -2,11 +2,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use serde::{Deserialize, Serialize};
+
 use super::numbers::{Addition, Numbers, Workshop};
 use super::rest::RestReadings;
 use super::signature::{Probes, Ranked, probes, start_by_direction};
-use serde::{Deserialize, Serialize};
-
 use crate::inference::Failure;
 use crate::mechanism::effects::{EffectKind, TableKind};
 use crate::model::{BatchFit, BatchWindow, Hypothesis};
