@@ -152,21 +152,19 @@ pub fn solve(
         steps += 1;
         // Where the weights change fast, less by the old ones may be more by the new.
         let after = there.as_ref().ok().and_then(|l| Some(l.cost + prior_cost(&trial) + problem.cost_of_weights()?));
-        match (before, there) {
-            (Some(before), there) if after.is_none_or(|after| after > before) && (!converged || there.is_err()) => {
-                problem.restore();
-                rejected += 1;
-                damping = (damping * 10.0).max(1e-2);
-                if rejected >= REJECTED {
-                    break;
-                }
+        let worse = before.is_some_and(|before| after.is_none_or(|after| after > before));
+        if worse && (!converged || there.is_err()) {
+            problem.restore();
+            rejected += 1;
+            damping = (damping * 10.0).max(1e-2);
+            if rejected >= REJECTED {
+                break;
             }
-            (_, there) => {
-                here = there?;
-                point = trial;
-                rejected = 0;
-                damping = (damping * 0.1_f64).max(1e-7);
-            }
+        } else {
+            here = there?;
+            point = trial;
+            rejected = 0;
+            damping = (damping * 0.1_f64).max(1e-7);
         }
     }
     let hessian = (&here.curvature + &prior.precision).cholesky().ok_or(Failure::Singular)?;
@@ -205,7 +203,8 @@ mod tests {
         let prior = Gaussian::from_moments(&DVector::zeros(1), &DMatrix::from_element(1, 1, 100.0)).expect("proper");
         let solution = solve(&mut Exponential, &prior, &DVector::from_element(1, -3.0), &SolverSettings::default())
             .expect("regular");
-        assert!((solution.point[0] - 2f64.ln()).abs() < 1e-3, "{solution:?}");
+        let converged = solution.steps < SolverSettings::default().steps;
+        assert!(converged && (solution.point[0] - 2f64.ln()).abs() < 1e-3, "{solution:?}");
         let settings = SolverSettings { keeps_last_linearization: true, ..SolverSettings::default() };
         let kept = solve(&mut Exponential, &prior, &DVector::from_element(1, -3.0), &settings).expect("regular");
         assert!((&kept.point - &solution.point).amax() < 1e-3, "{kept:?}");

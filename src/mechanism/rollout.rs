@@ -78,20 +78,11 @@ pub fn rollout_in<T: Real>(
     step_max_s: f64,
 ) -> Result<Trajectory<T>, RolloutError> {
     let carried = tracks.iter().any(|track| track.point != WrenchPoint::Recorded);
-    match SingleJoint::of(tree) {
-        Some(joint) if !carried => rollout_single(tree, &joint, initial, tracks, times_s, step_max_s),
-        _ => rollout_tree(workspace, tree, initial, tracks, times_s, step_max_s),
+    if let Some(joint) = SingleJoint::of(tree)
+        && !carried
+    {
+        return rollout_single(tree, &joint, initial, tracks, times_s, step_max_s);
     }
-}
-
-fn rollout_tree<T: Real>(
-    workspace: &mut Workspace<T>,
-    tree: &Tree<T>,
-    initial: &State<T>,
-    tracks: &[WrenchTrack<'_, T>],
-    times_s: &[f64],
-    step_max_s: f64,
-) -> Result<Trajectory<T>, RolloutError> {
     let mut state = initial.clone();
     let mut cursors = vec![0; tracks.len()];
     let mut wrenches: Vec<BodyWrench<T>> = Vec::with_capacity(tracks.len());

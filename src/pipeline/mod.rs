@@ -169,7 +169,7 @@ pub struct Pipeline {
     /// the window's number.
     handed_out: VecDeque<(u64, BTreeMap<Label, Pose>)>,
     closed_windows: u64,
-    forecaster: Option<Backlog>,
+    backlog: Option<Backlog>,
     /// The latest stamp of a frame.
     newest: Option<Stamp>,
     /// Windows are scored, not learned.
@@ -186,9 +186,9 @@ impl Pipeline {
     /// A pipeline that has seen nothing.
     pub fn new(settings: PipelineSettings) -> Self {
         let may_wait = settings.predict_beside_learning && !settings.live;
-        let forecaster = settings.predict.then(|| Backlog::new(Forecaster::new(&settings), may_wait));
+        let backlog = settings.predict.then(|| Backlog::new(Forecaster::new(&settings), may_wait));
         Self {
-            forecaster,
+            backlog,
             poses: PoseBuffer::new(settings.poses),
             last_frame_s: None,
             settings,
@@ -242,8 +242,8 @@ impl Pipeline {
                 ready.into_iter().flat_map(|stamp| self.push_frame(stamp, &[])).collect()
             }
             other => {
-                let predictions = match (&mut self.forecaster, &other) {
-                    (Some(forecaster), Input::Wrench(wrench)) => forecaster.push(News::Wrench(*wrench)),
+                let predictions = match (&mut self.backlog, &other) {
+                    (Some(backlog), Input::Wrench(wrench)) => backlog.push(News::Wrench(*wrench)),
                     _ => Vec::new(),
                 };
                 match (&mut self.cutter, other) {
@@ -266,7 +266,7 @@ impl Pipeline {
         }
         let window = self.cutter.as_mut().and_then(WindowCutter::flush);
         outputs.extend(window.into_iter().flat_map(|window| self.close(window)));
-        outputs.extend(self.forecaster.iter_mut().flat_map(Backlog::finish));
+        outputs.extend(self.backlog.iter_mut().flat_map(Backlog::finish));
         outputs
     }
 
@@ -300,7 +300,7 @@ impl Pipeline {
         outputs.extend(self.take_up(&frame, zero));
         outputs.extend(self.observe(&frame));
         let moving = self.moving;
-        let seen = self.forecaster.is_some().then(|| frame.clone());
+        let seen = self.backlog.is_some().then(|| frame.clone());
         if !self.is_open() && self.learner.is_none() && self.first_look.is_none() {
             self.reference.push(frame.clone());
             if self.settings.live && self.reference.len() == PREVIEW_FRAMES && self.preview.is_none() {
@@ -330,14 +330,14 @@ impl Pipeline {
         }
         let closed = window.is_some() && !self.settings.live;
         outputs.extend(window.into_iter().flat_map(|window| self.close(window)));
-        if let (Some(forecaster), Some(frame)) = (&mut self.forecaster, seen) {
+        if let (Some(backlog), Some(frame)) = (&mut self.backlog, seen) {
             if let Some(learner) = self.learner.as_ref().filter(|_| closed) {
-                outputs.extend(forecaster.push(News::Learned(Arc::clone(learner))));
+                outputs.extend(backlog.push(News::Learned(Arc::clone(learner))));
             }
             let rest = self.cutter.as_ref().and_then(WindowCutter::rest_reading).unwrap_or_default();
             let preview = self.preview.as_ref().filter(|_| self.first_look.is_some());
             let learner = self.learner.as_ref().or(preview).cloned();
-            outputs.extend(forecaster.push(News::Frame { frame, learner, zero, rest }));
+            outputs.extend(backlog.push(News::Frame { frame, learner, zero, rest }));
         }
         outputs
     }
@@ -347,8 +347,8 @@ impl Pipeline {
         self.poses.end_record();
         let Some(window) = self.cutter.as_mut().and_then(WindowCutter::end_record) else { return Vec::new() };
         let mut outputs = self.close(window);
-        if let (Some(forecaster), Some(learner), false) = (&mut self.forecaster, &self.learner, self.settings.live) {
-            outputs.extend(forecaster.push(News::Learned(Arc::clone(learner))));
+        if let (Some(backlog), Some(learner), false) = (&mut self.backlog, &self.learner, self.settings.live) {
+            outputs.extend(backlog.push(News::Learned(Arc::clone(learner))));
         }
         outputs
     }
@@ -420,8 +420,8 @@ impl Pipeline {
             return Vec::new();
         }
         let learning = Arc::make_mut(learner);
-        let forecaster = &mut self.forecaster;
-        let predict = || forecaster.as_mut().map_or_else(Vec::new, Backlog::catch_up);
+        let backlog = &mut self.backlog;
+        let predict = || backlog.as_mut().map_or_else(Vec::new, Backlog::catch_up);
         let ((), mut outputs) = rayon::join(|| learning.learn(&job), predict);
         self.current.extend(learner.displacements.iter().map(|(l, d)| (*l, *d)));
         outputs.push(Output::Learned { span_s: job.span_s() });
@@ -445,8 +445,8 @@ impl Pipeline {
         }
         self.learner = Some(Arc::clone(&learned.learner));
         (self.first_look, self.preview) = (None, None);
-        if let Some(forecaster) = &mut self.forecaster {
-            forecaster.forecaster.learned(&learned.learner, learned.mechanism.clone(), Some(&self.current));
+        if let Some(backlog) = &mut self.backlog {
+            backlog.forecaster.learned(&learned.learner, learned.mechanism.clone(), Some(&self.current));
         }
         Output::Learned { span_s: learned.span_s }
     }

@@ -177,8 +177,8 @@ impl Pipeline {
         let unknown: Vec<Label> = unknown.copied().collect();
         self.current = learner.displacements.clone();
         self.newcomers = (!unknown.is_empty()).then(Vec::new);
-        if let Some(forecaster) = &mut self.forecaster {
-            forecaster.forecaster.resumed(&learner, frame.time_s, positions);
+        if let Some(backlog) = &mut self.backlog {
+            backlog.forecaster.resumed(&learner, frame.time_s, positions);
         }
         let root = learner.root;
         self.learner = Some(Arc::new(learner));

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 
 use super::innovations::{Gain, Innovations, WindowModel, normal_equations};
 use super::layout::Mechanism;
-use super::site::{inertial_entries, reduction, scale_cost};
+use super::site::{inertial_entries, log_density, reduction, scale_cost};
 use super::track::JointTrack;
 use crate::inference::{Failure, Gaussian, LeastSquares, Linearization, SolverSettings, solve};
 use crate::model::Axis;
@@ -162,7 +162,7 @@ impl Hypothesis {
                 let own = &problem.by_window[w];
                 BatchedWindow {
                     noise_scale: scales[w],
-                    log_likelihood: -innovations.cost() - innovations.half_log_determinant - scale_cost(scales[w]),
+                    log_likelihood: log_density(innovations, scales[w]),
                     observations: innovations.whitened.len(),
                     active: own.clone(),
                     reduction: reduction(&innovations.whitened, windows[w].moving.len()),
@@ -204,16 +204,13 @@ impl Problem<'_> {
     /// κ of the greatest likelihood by window; far off it may have several tops.
     fn choose_scales(&self) -> Result<Vec<f64>, Failure> {
         let choose = |w: usize| {
-            let of = |innovations: &Innovations, scale: f64| {
-                -innovations.cost() - innovations.half_log_determinant - scale_cost(scale)
-            };
             let density = |scale: f64| {
                 // What was fitted last was fitted with this one.
                 if let Some(latest) = self.latest.get(w).filter(|_| scale == self.scales[w]) {
-                    return Ok(of(latest, scale));
+                    return Ok(log_density(latest, scale));
                 }
                 let model = self.hypothesis.window(self.windows[w], scale);
-                Ok::<_, Failure>(of(&model.linearize(&self.x, &[])?, scale))
+                Ok::<_, Failure>(log_density(&model.linearize(&self.x, &[])?, scale))
             };
             let densities = NOISE_SCALES.into_iter().filter_map(|scale| Some((scale, density(scale).ok()?)));
             let best = densities.max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.total_cmp(&a.0)));

@@ -470,8 +470,7 @@ impl WindowModel<'_> {
         let Slopes::Differences(plant, _) = slopes else { return Ok(transition) };
         for (i, deviation) in spread.iter().enumerate() {
             let (rate, by) = (spread.len() + i, deviation.max(DIFFERENCE));
-            let ends = [by, -by].map(|by| self.advance_moved(plant, state, (rate, by), span));
-            let [after, before] = ends;
+            let [after, before] = [by, -by].map(|by| self.advance_moved(plant, state, (rate, by), span));
             let slope = (after? - before?) / (2.0 * by);
             transition.view_mut((0, rate), (state.len(), 1)).copy_from(&slope);
         }

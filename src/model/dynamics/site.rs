@@ -172,15 +172,12 @@ impl WindowFit<'_> {
             x[at] = *value;
         }
         let mut tried = 0;
-        let of = |innovations: &Innovations, scale| {
-            -innovations.cost() - innovations.half_log_determinant - scale_cost(scale)
-        };
         let mut density = |scale: f64| {
             if scale == from {
-                return Ok(of(latest, scale));
+                return Ok(log_density(latest, scale));
             }
             tried += 1;
-            Ok::<_, Failure>(of(&self.model(scale).linearize(&x, &[])?, scale))
+            Ok::<_, Failure>(log_density(&self.model(scale).linearize(&x, &[])?, scale))
         };
         let mut at = NOISE_SCALES.iter().position(|s| *s >= from).unwrap_or(0);
         let mut best = density(NOISE_SCALES[at])?;
@@ -276,6 +273,11 @@ fn retracted(joint: &KinematicJoint, which: usize, step: f64) -> Axis {
     } else {
         Axis { direction, point: point + along * step }
     }
+}
+
+/// Log density of innovations and of κ, up to constants.
+pub fn log_density(innovations: &Innovations, scale: f64) -> f64 {
+    -innovations.cost() - innovations.half_log_determinant - scale_cost(scale)
 }
 
 /// −ln prior of κ.
