@@ -122,6 +122,15 @@ impl<T: Real> SpatialInertia<T> {
         Self { mass: self.mass, first_moment: turned + t * self.mass, about_origin }
     }
 
+    /// How it differs from another, per `by`.
+    pub(super) fn slope_from(&self, other: &Self, by: T) -> Self {
+        Self {
+            mass: (self.mass - other.mass) / by,
+            first_moment: (self.first_moment - other.first_moment) / by,
+            about_origin: (self.about_origin - other.about_origin) / by,
+        }
+    }
+
     /// The momentum of the body under a twist: I V.
     pub fn momentum(&self, twist: &Spatial<T>) -> Spatial<T> {
         let Spatial { angular, linear } = twist;

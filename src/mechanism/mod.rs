@@ -18,6 +18,7 @@ mod rollout;
 mod single;
 mod solve;
 mod step;
+mod tangent;
 #[cfg(test)]
 mod tests;
 mod tree;
@@ -32,5 +33,6 @@ pub use parameters::{JointForces, JointParameters};
 pub use rollout::{Reach, RolloutError, Trajectory, advance_single, rollout, rollout_in};
 pub use single::{SingleJoint, SingleState};
 pub use step::{BodyWrench, State, Step, WrenchOrigin, step};
+pub use tangent::{StateSlopes, TangentWorkspace, TreeSlope, advance_with_slopes};
 pub use tree::{Body, Tree, TreeError};
 pub use workspace::Workspace;

@@ -202,7 +202,7 @@ fn empty_trajectory<T: Real>(body_count: usize, times: usize) -> Trajectory<T> {
 }
 
 /// The steps that lead to the i-th time.
-fn steps(times_s: &[f64], i: usize, step_max_s: f64) -> impl Iterator<Item = Step> {
+pub(super) fn steps(times_s: &[f64], i: usize, step_max_s: f64) -> impl Iterator<Item = Step> {
     let start_s = times_s[i.saturating_sub(1)];
     let span_s = times_s[i] - start_s;
     // A span that is a whole number of steps but for rounding takes that number.

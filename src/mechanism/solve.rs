@@ -22,6 +22,8 @@ pub(super) struct SolveScratch<T: Real> {
     slipping: Vec<usize>,
     factor: Vec<T>,
     right: Vec<T>,
+    /// Whether a joint turned round.
+    turned: bool,
 }
 
 impl<T: Real> SolveScratch<T> {
@@ -33,10 +35,43 @@ impl<T: Real> SolveScratch<T> {
             slipping: Vec::with_capacity(n),
             factor: vec![T::zero(); n * n],
             right: vec![T::zero(); n],
+            turned: false,
         }
     }
 }
 
+impl<T: Real> SolveScratch<T> {
+    /// Whether the rates were the linear solution for several joints that slip, stick, or both.
+    pub fn is_regular(&self) -> bool {
+        let limited = |regime: &Regime| matches!(regime, Regime::AtLeast | Regime::AtGreatest);
+        !self.regimes.is_empty() && !self.turned && !self.regimes.iter().any(limited)
+    }
+
+    /// What each joint did.
+    pub fn regimes(&self) -> &[Regime] {
+        &self.regimes
+    }
+
+    /// Derivatives of the rates, in place, from those of the impulses, after a regular step.
+    pub fn carry(&self, impulses: &mut [T]) {
+        let m = self.slipping.len();
+        let mut right = [T::zero(); SMALL];
+        let mut long = Vec::new();
+        let right = if m <= SMALL {
+            &mut right[..m]
+        } else {
+            long.resize(m, T::zero());
+            &mut long[..]
+        };
+        right.iter_mut().zip(&self.slipping).for_each(|(own, &j)| *own = impulses[j]);
+        substitute(&self.factor, right, m);
+        impulses.fill(T::zero());
+        right.iter().zip(&self.slipping).for_each(|(own, &j)| impulses[j] = *own);
+    }
+}
+
+/// Joints that need no memory of their own.
+const SMALL: usize = 8;
 /// Rounds of sweeps and Newton step before the last guess is taken; enough for random problems of
 /// six joints and condition number 10⁴ (test `many_joints_meet_the_law`).
 const ROUNDS_MAX: usize = 100;
@@ -54,6 +89,7 @@ pub(super) fn solve<T: Real>(a: &[T], b: &[T], rows: &mut [Row<T>], rates: &mut 
     }
     scratch.before.clear();
     scratch.before.extend_from_slice(rates);
+    scratch.turned = false;
     find_regimes(a, b, rows, rates, scratch);
     share_friction_of_turning(a, b, rows, rates, scratch);
 }
@@ -154,6 +190,7 @@ fn share_friction_of_turning<T: Real>(
     if !any_turns {
         return;
     }
+    scratch.turned = true;
     for j in 0..n {
         if turns(j, scratch) {
             scratch.regimes[j] = scratch.regimes[j].reversed();
@@ -265,6 +302,11 @@ fn solve_symmetric<T: Real>(g: &mut [T], r: &mut [T], n: usize) {
         }
         g[i * n + i] = pivot;
     }
+    substitute(g, r, n);
+}
+
+/// Solves L D Lᵀ x = r in place.
+fn substitute<T: Real>(g: &[T], r: &mut [T], n: usize) {
     for i in 0..n {
         for k in 0..i {
             let term = g[i * n + k] * r[k];

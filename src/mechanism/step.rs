@@ -106,14 +106,7 @@ pub fn step<T: Real>(
         let momentum = (0..n).fold(T::zero(), |sum, j| sum + workspace.mass_matrix[k * n + j] * workspace.rates[j]);
         let applied = workspace.applied[k] - workspace.bias[k];
         let parameters = &tree.bodies()[body].parameters;
-        let joint = JointState {
-            position: workspace.middle[body],
-            rate: workspace.middle_rates[k],
-            acceleration: (rate - state.rates_before[body]) * T::constant(1.0 / step.length_s),
-            time_s: step.middle_s,
-            step_s: step.length_s,
-        };
-        let forces = parameters.forces(&joint);
+        let forces = parameters.forces(&joint_state(tree, state, workspace, k, step));
         let damping = ImplicitDamping::new(forces.damping, workspace.mass_matrix[k * n + k], step.length_s);
         workspace.applied[k] = momentum - damping.before * rate + (applied + forces.force) * T::constant(step.length_s);
         let approach = Approach {
@@ -137,6 +130,25 @@ pub fn step<T: Real>(
             workspace.rows[k].limited_position(rate).unwrap_or_else(|| workspace.middle[body] + rate * half);
         state.rates_before[body] = state.rates[body];
         state.rates[body] = rate;
+    }
+}
+
+/// What the forces of the k-th moving joint depend on, from the state before the step and the middle of it.
+#[inline]
+pub(super) fn joint_state<T: Real>(
+    tree: &Tree<T>,
+    before: &State<T>,
+    workspace: &Workspace<T>,
+    k: usize,
+    step: Step,
+) -> JointState<T> {
+    let body = tree.moving[k];
+    JointState {
+        position: workspace.middle[body],
+        rate: workspace.middle_rates[k],
+        acceleration: (before.rates[body] - before.rates_before[body]) * T::constant(1.0 / step.length_s),
+        time_s: step.middle_s,
+        step_s: step.length_s,
     }
 }
 

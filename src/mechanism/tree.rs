@@ -236,7 +236,7 @@ impl<T: Real> Tree<T> {
     /// per moving joint.
     pub(super) fn update_bias(&self, rates: &[T], workspace: &mut Workspace<T>) {
         let Workspace { screws, inertias, twists, accelerations, forces, bias, .. } = workspace;
-        let upward = Spatial { angular: Vector3::zeros(), linear: self.gravity.map(|g| T::constant(-g)) };
+        let upward = self.upward();
         for k in 0..self.moving.len() {
             let (twist, acceleration) = match self.parents[k] {
                 Some(parent) => (twists[parent], accelerations[parent]),
@@ -255,6 +255,11 @@ impl<T: Real> Tree<T> {
                 forces[parent] += force;
             }
         }
+    }
+
+    /// The acceleration that stands for gravity.
+    pub(super) fn upward(&self) -> Spatial<T> {
+        Spatial { angular: Vector3::zeros(), linear: self.gravity.map(|g| T::constant(-g)) }
     }
 
     /// Adds a world wrench on `body` to the generalized forces: τ_j += S_j(q)ᵀ w for every moving
@@ -346,7 +351,7 @@ impl<T: Real> Tree<T> {
 }
 
 /// exp(S q), cheaper for the two zero-pitch screws than the general exponential.
-fn joint_displacement<T: Real>(joint: JointType, screw: &Spatial<T>, q: T) -> Pose<T> {
+pub(super) fn joint_displacement<T: Real>(joint: JointType, screw: &Spatial<T>, q: T) -> Pose<T> {
     match joint {
         JointType::Rigid => Pose::identity(),
         JointType::Prismatic => Pose::from_translation(screw.linear * q),

@@ -7,13 +7,12 @@
 //! with covariance S, and −½ Σ (eᵀ S⁻¹ e + ln |S|) is the log likelihood (Ljung, "System
 //! Identification", 1999, section 7.4; Kristensen, Madsen, Jørgensen, Automatica 40, 2004).
 //! The state holds the contact point's constant error beside (q, q̇). Derivatives are for fixed gains,
-//! by forward mode for one joint.
+//! by forward mode for one joint and by the structure of the equations for several.
 
 use std::cell::RefCell;
 
 use nalgebra::{DMatrix, DVector, Vector3};
 use num_dual::DualSVec64;
-use rayon::prelude::*;
 
 use super::layout::{AddedTable, Mechanism, SensorError};
 use super::track::{CONTACT_DEVIATION, Drive, JointTrack, Observation};
@@ -21,8 +20,8 @@ use crate::inference::Failure;
 use crate::math::Real;
 use crate::mechanism::effects::TableSpan;
 use crate::mechanism::{
-    Reach, SingleJoint, Spatial, State, Tree, Workspace, WrenchPoint, WrenchSample, WrenchTrack, advance_single,
-    rollout_in,
+    Reach, SingleJoint, Spatial, State, StateSlopes, TangentWorkspace, Tree, TreeSlope, Workspace, WrenchPoint,
+    WrenchSample, WrenchTrack, advance_single, advance_with_slopes, rollout_in,
 };
 use crate::model::Axis;
 
@@ -81,13 +80,9 @@ pub(super) struct FilterStep {
 
 /// The way from one observation to the next.
 struct Advance {
-    span: [f64; 2],
-    /// (q, q̇) at its start and at its end.
-    before: DVector<f64>,
-    after: DVector<f64>,
     /// Of the whole state.
     transition: DMatrix<f64>,
-    /// Of (q, q̇) by the parameters, as far as they are taken with the simulation, and by (q, q̇) before.
+    /// Of (q, q̇) by the parameters, and by (q, q̇) before.
     derivatives: DMatrix<f64>,
 }
 
@@ -129,8 +124,7 @@ impl Innovations {
 
 /// Directions that one simulation of a single joint carries derivatives along, at most.
 const CHUNK: usize = 8;
-/// Step of finite differences where several joints move. Dual numbers through a chain of three cost
-/// 60 ms a window in copies, one more simulation .3 ms; away from switches the two agree to 1e-5.
+/// Step of what is differenced where several joints move.
 const DIFFERENCE: f64 = 1e-6;
 /// A position or rate this near an interval of a table may lie in it \[m or rad, m/s or rad/s\].
 const TABLE_MARGIN: f64 = 1e-9;
@@ -166,8 +160,18 @@ struct Forward {
 /// How the derivatives of a span are taken.
 enum Slopes {
     Forward(Box<Forward>),
-    /// The plant, and one for each parameter moved by [`DIFFERENCE`].
-    Differences(Box<Plant<f64>>, Vec<Plant<f64>>),
+    Chain(Box<Chain>),
+}
+
+/// Several joints, and how they depend on the parameters.
+struct Chain {
+    plant: Plant<f64>,
+    /// The parameters of the tree, and their places among all.
+    slopes: Vec<TreeSlope>,
+    places: Vec<usize>,
+    /// The other parameters, those of the sensor: their places, and the plants with them moved by [`DIFFERENCE`].
+    moved: Vec<(usize, Plant<f64>)>,
+    workspace: RefCell<TangentWorkspace>,
 }
 
 impl WindowModel<'_> {
@@ -175,7 +179,7 @@ impl WindowModel<'_> {
     pub fn linearize(&self, x: &[f64], active: &[usize]) -> Result<Innovations, Failure> {
         let n = self.moving.len();
         let p = active.len();
-        let slopes = if n > 1 { self.differences(x, active)? } else { self.forward(x, active)? };
+        let slopes = self.slopes(x, active)?;
         let noise = ProcessNoise::new(self, x)?;
         let observations = &self.track.observations;
         if observations.len() < 3 {
@@ -201,7 +205,7 @@ impl WindowModel<'_> {
                 covariance = &carried * covariance * carried.transpose();
                 let mut own = covariance.view_mut((0, 0), (2 * n, 2 * n));
                 own += noise.over(span, &self.all_positions(state.as_slice()), self)?;
-                advance = Some(Advance { span, before, after: next, transition, derivatives });
+                advance = Some(Advance { transition, derivatives });
             }
             let rows = state_rows(observation);
             let innovation = &observation.value - &rows * &state;
@@ -218,21 +222,7 @@ impl WindowModel<'_> {
             state += &gain * innovation;
             passed.push(Passed { advance, rows, gain: Gain { gain, deviation } });
         }
-        match slopes {
-            Slopes::Forward(_) => self.forward_slopes(&passed, p, &mut result.slopes)?,
-            Slopes::Differences(_, moved) => {
-                let column = |plant: Plant<f64>| {
-                    self.innovation_slopes(&passed, |advance| {
-                        let end = self.advance(&plant, advance.before.as_slice(), advance.span)?;
-                        Ok((DVector::from_vec(end) - &advance.after) / DIFFERENCE)
-                    })
-                };
-                // In the order of `active`, so threads do not show in the result.
-                let columns: Vec<Vec<f64>> = moved.into_par_iter().map(column).collect::<Result<_, _>>()?;
-                result.slopes =
-                    (0..result.whitened.len()).flat_map(|row| columns.iter().map(move |c| c[row])).collect();
-            }
-        }
+        self.innovation_slopes(&passed, p, &mut result.slopes)?;
         result.gains = passed.into_iter().map(|passed| passed.gain).collect();
         if result.whitened.iter().chain(&result.slopes).all(|e| e.is_finite()) {
             Ok(result)
@@ -241,31 +231,8 @@ impl WindowModel<'_> {
         }
     }
 
-    /// Derivatives of the whitened innovations by one parameter, with `driven` its derivative of a span's
-    /// end for a fixed start.
-    fn innovation_slopes(
-        &self,
-        passed: &[Passed],
-        driven: impl Fn(&Advance) -> Result<DVector<f64>, Failure>,
-    ) -> Result<Vec<f64>, Failure> {
-        let n = self.moving.len();
-        let mut slope = DVector::zeros(2 * n + CONTACT);
-        let mut all = Vec::with_capacity(n * passed.len());
-        for Passed { advance, rows, gain: Gain { gain, deviation } } in passed {
-            if let Some(advance) = advance {
-                slope = &advance.transition * slope;
-                let mut own = slope.rows_mut(0, 2 * n);
-                own += driven(advance)?;
-            }
-            let innovation = -(rows * &slope);
-            slope += gain * &innovation;
-            all.extend(deviation.solve_lower_triangular(&innovation).ok_or(Failure::Diverged)?.iter());
-        }
-        Ok(all)
-    }
-
-    /// The same by all `p` parameters at once, row by row, where their derivatives came with the simulation.
-    fn forward_slopes(&self, passed: &[Passed], p: usize, all: &mut Vec<f64>) -> Result<(), Failure> {
+    /// Derivatives of the whitened innovations by the `p` parameters, row by row.
+    fn innovation_slopes(&self, passed: &[Passed], p: usize, all: &mut Vec<f64>) -> Result<(), Failure> {
         let n = self.moving.len();
         let mut slope = DMatrix::zeros(2 * n + CONTACT, p);
         all.reserve(n * p * passed.len());
@@ -287,7 +254,7 @@ impl WindowModel<'_> {
     pub(super) fn filtered(&self, x: &[f64]) -> Result<Vec<FilterStep>, Failure> {
         let n = self.moving.len();
         let size = 2 * n + CONTACT;
-        let slopes = if n > 1 { self.differences(x, &[])? } else { self.forward(x, &[])? };
+        let slopes = self.slopes(x, &[])?;
         let noise = ProcessNoise::new(self, x)?;
         let mut predicted = self.first_state();
         let mut covariance = self.first_covariance(&predicted);
@@ -404,18 +371,29 @@ impl WindowModel<'_> {
         })
     }
 
-    fn differences(&self, x: &[f64], active: &[usize]) -> Result<Slopes, Failure> {
-        let moved = active.iter().map(|&at| {
+    fn chain(&self, x: &[f64], active: &[usize]) -> Result<Slopes, Failure> {
+        let plant = self.plant(x)?;
+        let workspace = RefCell::new(TangentWorkspace::new(&plant.tree));
+        let mut chain = Chain { plant, slopes: Vec::new(), places: Vec::new(), moved: Vec::new(), workspace };
+        for (place, &at) in active.iter().enumerate() {
             let mut moved = x.to_vec();
             moved[at] += DIFFERENCE;
-            self.plant(&moved)
-        });
-        let moved = moved.collect::<Result<_, Failure>>()?;
-        Ok(Slopes::Differences(Box::new(self.plant(x)?), moved))
+            let moved: Plant<f64> = self.plant(&moved)?;
+            if moved.sensor == chain.plant.sensor {
+                chain.slopes.push(TreeSlope::new(&chain.plant.tree, moved.tree, DIFFERENCE));
+                chain.places.push(place);
+            } else {
+                chain.moved.push((place, moved));
+            }
+        }
+        Ok(Slopes::Chain(Box::new(chain)))
     }
 
-    /// The state after a span, and its derivatives: by parameters where they come with the simulation, then
-    /// by the state before.
+    fn slopes(&self, x: &[f64], active: &[usize]) -> Result<Slopes, Failure> {
+        if self.moving.len() > 1 { self.chain(x, active) } else { self.forward(x, active) }
+    }
+
+    /// The state after a span, and its derivatives by the `p` parameters, then by the state before.
     fn advance_with_slopes(
         &self,
         slopes: &Slopes,
@@ -425,15 +403,7 @@ impl WindowModel<'_> {
     ) -> Result<(DVector<f64>, DMatrix<f64>), Failure> {
         let forward = match slopes {
             Slopes::Forward(forward) => forward,
-            Slopes::Differences(plant, _) => {
-                let after = DVector::from_vec(self.advance(plant, state.as_slice(), span)?);
-                let mut derivatives = DMatrix::zeros(state.len(), state.len());
-                for i in 0..state.len() {
-                    let end = self.advance_moved(plant, state, (i, DIFFERENCE), span)?;
-                    derivatives.set_column(i, &((end - &after) / DIFFERENCE));
-                }
-                return Ok((after, derivatives));
-            }
+            Slopes::Chain(chain) => return self.advance_chain(chain, state, span, p),
         };
         let size = state.len();
         let mut passage = Passage { span, p, after: DVector::zeros(size), derivatives: DMatrix::zeros(size, p + size) };
@@ -467,10 +437,10 @@ impl WindowModel<'_> {
         spread: &[f64],
         span: [f64; 2],
     ) -> Result<DMatrix<f64>, Failure> {
-        let Slopes::Differences(plant, _) = slopes else { return Ok(transition) };
+        let Slopes::Chain(chain) = slopes else { return Ok(transition) };
         for (i, deviation) in spread.iter().enumerate() {
             let (rate, by) = (spread.len() + i, deviation.max(DIFFERENCE));
-            let [after, before] = [by, -by].map(|by| self.advance_moved(plant, state, (rate, by), span));
+            let [after, before] = [by, -by].map(|by| self.advance_moved(&chain.plant, state, (rate, by), span));
             let slope = (after? - before?) / (2.0 * by);
             transition.view_mut((0, rate), (state.len(), 1)).copy_from(&slope);
         }
@@ -488,6 +458,43 @@ impl WindowModel<'_> {
         let mut start = state.clone();
         start[entry] += by;
         Ok(DVector::from_vec(self.advance(plant, start.as_slice(), span)?))
+    }
+
+    /// [`Self::advance_with_slopes`] where several joints move.
+    fn advance_chain(
+        &self,
+        chain: &Chain,
+        state: &DVector<f64>,
+        span: [f64; 2],
+        p: usize,
+    ) -> Result<(DVector<f64>, DMatrix<f64>), Failure> {
+        let Chain { plant, slopes, places, moved, workspace } = chain;
+        let (n, own) = (self.moving.len(), slopes.len());
+        let first = |at: usize| DMatrix::from_fn(n, own + 2 * n, |k, c| if c == own + at + k { 1.0 } else { 0.0 });
+        let (mut positions, mut rates) = (first(0), first(n));
+        let mut after = state.clone();
+        let contacts = self.contacts(&plant.sensor);
+        for span in even_spans(&contacts, span).into_iter().flatten() {
+            let tracks = self.tracks(&plant.sensor, span, &contacts);
+            let start = self.tree_state(after.as_slice());
+            let mut carried = StateSlopes::new(positions, rates);
+            let along = (&slopes[..], &mut carried);
+            let mut workspace = workspace.borrow_mut();
+            let end = advance_with_slopes(&plant.tree, &start, &tracks, (span, CHAIN_STEP_S), along, &mut workspace)
+                .map_err(|_| Failure::Diverged)?;
+            after = DVector::from_vec(self.of_moving(&end.positions, &end.rates));
+            (positions, rates) = (carried.positions, carried.rates);
+        }
+        let mut derivatives = DMatrix::zeros(2 * n, p + 2 * n);
+        for (c, place) in places.iter().copied().chain(p..p + 2 * n).enumerate() {
+            derivatives.view_mut((0, place), (n, 1)).copy_from(&positions.column(c));
+            derivatives.view_mut((n, place), (n, 1)).copy_from(&rates.column(c));
+        }
+        for (place, plant) in moved {
+            let end = DVector::from_vec(self.advance(plant, state.as_slice(), span)?);
+            derivatives.set_column(*place, &((end - &after) / DIFFERENCE));
+        }
+        Ok((after, derivatives))
     }
 
     /// Carries a chunk's derivatives through a span.
@@ -538,35 +545,37 @@ impl WindowModel<'_> {
         span: [f64; 2],
         mut reach: Option<&mut Reach>,
     ) -> Result<Vec<T>, Failure> {
-        // The sensor's errors act while the tool does, so a span in which contact begins or ends is cut.
-        let delay_s = plant.sensor.delay_s.value();
+        let contacts = self.contacts(&plant.sensor);
+        let mut state = state.to_vec();
+        for span in even_spans(&contacts, span).into_iter().flatten() {
+            let tracks = self.tracks(&plant.sensor, span, &contacts);
+            state = self.advance_evenly(plant, &state, span, &tracks, reach.as_deref_mut())?;
+        }
+        Ok(state)
+    }
+
+    /// When each drive's contact begins and ends, where the sensor's bias acts in between.
+    fn contacts<T: Real>(&self, sensor: &SensorError<T>) -> Vec<Option<[f64; 2]>> {
+        let delay_s = sensor.delay_s.value();
         let ends = |drive: &Drive| {
             let samples = &drive.samples;
             (drive.tool && samples.len() > 4 && self.mechanism.sensor.bias)
                 .then(|| [samples[1].stamp_s - delay_s, samples[samples.len() - 2].stamp_s - delay_s])
         };
-        let contacts: Vec<Option<[f64; 2]>> = self.track.drives.iter().map(ends).collect();
-        let within = |t: &f64| *t > span[0] + 1e-6 && *t < span[1] - 1e-6;
-        if let Some(cut) = contacts.iter().flatten().flatten().copied().find(|t| within(t)) {
-            let middle = self.advance_evenly(plant, state, [span[0], cut], &contacts, reach.as_deref_mut())?;
-            return self.advance_evenly(plant, &middle, [cut, span[1]], &contacts, reach);
-        }
-        self.advance_evenly(plant, state, span, &contacts, reach)
+        self.track.drives.iter().map(ends).collect()
     }
 
-    fn advance_evenly<T: Real>(
+    /// What acts in a span.
+    fn tracks<T: Real>(
         &self,
-        Plant { tree, single, sensor, workspace }: &Plant<T>,
-        state: &[T],
+        sensor: &SensorError<T>,
         span: [f64; 2],
         contacts: &[Option<[f64; 2]>],
-        reach: Option<&mut Reach>,
-    ) -> Result<Vec<T>, Failure> {
-        let n = self.moving.len();
+    ) -> Vec<WrenchTrack<'_, T>> {
         let middle_s = 0.5 * (span[0] + span[1]);
         let delay_s = sensor.delay_s.value();
         let drives = self.track.drives.iter().zip(contacts);
-        let tracks: Vec<WrenchTrack<'_, T>> = drives
+        drives
             .filter(|(_, contact)| contact.is_none_or(|[from, to]| middle_s > from && middle_s < to))
             .map(|(drive, contact)| {
                 // Where a bias counts, the zeros about the contact do not.
@@ -582,26 +591,45 @@ impl WindowModel<'_> {
                     torque_bias: bias(sensor.torque_bias),
                 }
             })
-            .collect();
+            .collect()
+    }
+
+    fn advance_evenly<T: Real>(
+        &self,
+        Plant { tree, single, workspace, .. }: &Plant<T>,
+        state: &[T],
+        span: [f64; 2],
+        tracks: &[WrenchTrack<'_, T>],
+        reach: Option<&mut Reach>,
+    ) -> Result<Vec<T>, Failure> {
         if let Some(single) = single
             && *self.moving == [single.body]
         {
             let start = (state[0], state[1]);
-            let end = advance_single((tree, single), start, &tracks, span, STEP_S, reach);
+            let end = advance_single((tree, single), start, tracks, span, STEP_S, reach);
             return end.map(|(position, rate)| vec![position, rate]).map_err(|_| Failure::Diverged);
         }
+        let step_s = if self.moving.len() > 1 { CHAIN_STEP_S } else { STEP_S };
+        let start = self.tree_state(state);
+        let run = rollout_in(&mut workspace.borrow_mut(), tree, &start, tracks, &span, step_s)
+            .map_err(|_| Failure::Diverged)?;
+        Ok(self.of_moving(run.positions(1), run.rates(1)))
+    }
+
+    /// The tree's state from (q, q̇) of the moving joints.
+    fn tree_state<T: Real>(&self, state: &[T]) -> State<T> {
         let mut positions = vec![T::zero(); self.mechanism.joints.len()];
         let mut rates = positions.clone();
         for (i, &joint) in self.moving.iter().enumerate() {
             positions[joint] = state[i];
-            rates[joint] = state[n + i];
+            rates[joint] = state[self.moving.len() + i];
         }
-        let step_s = if n > 1 { CHAIN_STEP_S } else { STEP_S };
-        let start = State::new(positions, rates);
-        let run = rollout_in(&mut workspace.borrow_mut(), tree, &start, &tracks, &span, step_s)
-            .map_err(|_| Failure::Diverged)?;
-        let (positions, rates) = (run.positions(1), run.rates(1));
-        Ok(self.moving.iter().map(|&j| positions[j]).chain(self.moving.iter().map(|&j| rates[j])).collect())
+        State::new(positions, rates)
+    }
+
+    /// (q, q̇) of the moving joints from those of all.
+    fn of_moving<T: Real>(&self, positions: &[T], rates: &[T]) -> Vec<T> {
+        [positions, rates].into_iter().flat_map(|all| self.moving.iter().map(|&joint| all[joint])).collect()
     }
 
     /// Positions of all joints, those of the moving ones from a state; the others' are in the tree.
@@ -640,6 +668,15 @@ impl WindowModel<'_> {
         };
         let ((t1, x1), (t2, x2)) = (point(ahead.div_ceil(2)), point(ahead));
         if t1 > 0.0 && t2 > t1 { (x1 * t2 / t1 - x2 * t1 / t2) / (t2 - t1) } else { x2 / t2 }
+    }
+}
+
+/// A span in parts in which contact neither begins nor ends: the sensor's errors act while the tool does.
+fn even_spans(contacts: &[Option<[f64; 2]>], span: [f64; 2]) -> [Option<[f64; 2]>; 2] {
+    let within = |t: &f64| *t > span[0] + 1e-6 && *t < span[1] - 1e-6;
+    match contacts.iter().flatten().flatten().copied().find(within) {
+        Some(cut) => [Some([span[0], cut]), Some([cut, span[1]])],
+        None => [Some(span), None],
     }
 }
 
