@@ -34,6 +34,8 @@ const CHAIN_STEP_S: f64 = 0.008;
 /// a floor of the process noise, for the time when no wrench acts.
 const FRICTION_SHARE: f64 = 0.02;
 const FRICTION_SPAN_S: f64 = 0.02;
+/// A joint whose rate is this many standard deviations from zero is not about to stick.
+const CLEAR: f64 = 3.0;
 /// Standard deviation of the first position \[m or rad\] and rate \[m/s or rad/s\].
 const FIRST_POSITION: f64 = 0.02;
 const FIRST_RATE: f64 = 0.1;
@@ -201,7 +203,8 @@ impl WindowModel<'_> {
                 let at = derivatives.ncols() - 2 * n;
                 let mut transition = DMatrix::identity(size, size);
                 transition.view_mut((0, 0), (2 * n, 2 * n)).copy_from(&derivatives.columns(at, 2 * n));
-                let carried = self.over_spread(&slopes, transition.clone(), &before, &spread, span)?;
+                let ends = [before.as_slice(), next.as_slice()];
+                let carried = self.over_spread(&slopes, transition.clone(), ends, &spread, span)?;
                 covariance = &carried * covariance * carried.transpose();
                 let mut own = covariance.view_mut((0, 0), (2 * n, 2 * n));
                 own += noise.over(span, &self.all_positions(state.as_slice()), self)?;
@@ -270,7 +273,8 @@ impl WindowModel<'_> {
                 predicted.copy_from(&last.updated);
                 predicted.rows_mut(0, 2 * n).copy_from(&next);
                 transition.view_mut((0, 0), (2 * n, 2 * n)).copy_from(&derivatives.columns(0, 2 * n));
-                transition = self.over_spread(&slopes, transition, &moved, &spread, span)?;
+                let ends = [moved.as_slice(), next.as_slice()];
+                transition = self.over_spread(&slopes, transition, ends, &spread, span)?;
                 covariance = &transition * &last.updated_covariance * transition.transpose();
                 let mut own = covariance.view_mut((0, 0), (2 * n, 2 * n));
                 own += noise.over(span, &self.all_positions(predicted.as_slice()), self)?;
@@ -428,19 +432,26 @@ impl WindowModel<'_> {
 
     /// The transition of a covariance whose rates have the standard deviations `spread`: a joint of a chain that
     /// sticks forgets its rate, but not if it may well be moving, so that differences are taken over what the
-    /// rate may be (Norgaard, Poulsen, Ravn, Automatica 36, 2000).
+    /// rate may be (Norgaard, Poulsen, Ravn, Automatica 36, 2000), unless all joints go on as they go. `ends` are
+    /// (q, q̇) before and after the span.
     fn over_spread(
         &self,
         slopes: &Slopes,
         mut transition: DMatrix<f64>,
-        state: &DVector<f64>,
+        ends: [&[f64]; 2],
         spread: &[f64],
         span: [f64; 2],
     ) -> Result<DMatrix<f64>, Failure> {
         let Slopes::Chain(chain) = slopes else { return Ok(transition) };
+        let [before, after] = ends.map(|end| &end[spread.len()..]);
+        let goes_on = |i: usize| before[i] * after[i] > 0.0 && before[i].abs().min(after[i].abs()) > CLEAR * spread[i];
+        if (0..spread.len()).all(goes_on) {
+            return Ok(transition);
+        }
+        let state = DVector::from_column_slice(ends[0]);
         for (i, deviation) in spread.iter().enumerate() {
             let (rate, by) = (spread.len() + i, deviation.max(DIFFERENCE));
-            let [after, before] = [by, -by].map(|by| self.advance_moved(&chain.plant, state, (rate, by), span));
+            let [after, before] = [by, -by].map(|by| self.advance_moved(&chain.plant, &state, (rate, by), span));
             let slope = (after? - before?) / (2.0 * by);
             transition.view_mut((0, rate), (state.len(), 1)).copy_from(&slope);
         }

@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, VecDeque};
 
 use nalgebra::{DMatrix, DVector, Matrix2, Vector3};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::layout::{
@@ -28,9 +29,10 @@ const REVISIT_STEPS: usize = 12;
 /// Linearizations for one window with another end stop than it was just fitted with, at most.
 const STOP_STEPS: usize = 6;
 /// A window whose noise is as much times what the wrench sensor explains may be fitted wrongly, and then ln
-/// friction is tried with these shifts.
+/// friction is tried with these shifts, by so many linearizations until it shows promise.
 const DOUBTED: f64 = 100.0;
 const RELEASES: [f64; 2] = [-0.4, -1.0];
+const RELEASE_STEPS: usize = 5;
 /// A joint that stops at an end of its range stays there as long \[s\].
 const SHORTEST_HALT: f64 = 0.1;
 /// Effects in time are expected within a record of this length \[s\].
@@ -726,17 +728,25 @@ impl DynamicsLearner {
         let mut fitted = window_fit.fit(&prior, &starts, noise_scale, steps)?;
         if warm.is_none() && fitted.noise_scale >= DOUBTED {
             // Where friction holds a joint that moved, nothing says by how much it is too great.
-            for shift in RELEASES {
+            let glance = |shift: f64| {
                 let other = with_friction(&start, shift, active, &self.mechanism, moving);
-                let trial = window_fit.fit(&prior, &[other], None, steps);
-                let spent = fitted.steps + trial.as_ref().map_or(1, |trial| trial.steps);
-                if let Ok(trial) = trial
+                window_fit.fit(&prior, &[other], None, RELEASE_STEPS)
+            };
+            let glances: Vec<_> = RELEASES.into_par_iter().map(glance).collect();
+            let mut spent = fitted.steps;
+            for seen in glances {
+                let Ok(seen) = seen.inspect(|seen| spent += seen.steps) else { continue };
+                if seen.noise_scale >= fitted.noise_scale && seen.log_predictive <= fitted.log_predictive {
+                    continue;
+                }
+                let trial = window_fit.fit(&prior, &[seen.solution.point], None, steps);
+                if let Ok(trial) = trial.inspect(|trial| spent += trial.steps)
                     && trial.log_predictive > fitted.log_predictive
                 {
                     fitted = trial;
                 }
-                fitted.steps = spent;
             }
+            fitted.steps = spent;
         }
         let deviations = self.deviations(fit, &involved, input.use_tool || !self.windows[window].contacts.is_empty());
         let sensitivity = window_fit.sensitivity(&fitted, &deviations);

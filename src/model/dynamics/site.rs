@@ -6,6 +6,7 @@
 //! which the kinematic fit took from the same data; errors of η that windows share stay shared.
 
 use nalgebra::{DMatrix, DVector};
+use rayon::prelude::*;
 
 use super::innovations::{Gain, Innovations, WindowModel, normal_equations};
 use super::layout::{FRICTION, Mechanism};
@@ -116,25 +117,23 @@ impl WindowFit<'_> {
         steps: usize,
     ) -> Result<FittedWindow, Failure> {
         let mut spent = 0;
-        let mut best: Option<(f64, DVector<f64>)> = None;
         let first_scale = noise_scale.unwrap_or(NOISE_SCALES[1]);
-        for start in starts {
-            if starts.len() == 1 {
-                best = Some((0.0, start.clone()));
-                break;
+        let mut point = match starts {
+            [start] => start.clone(),
+            _ => {
+                let settings = SolverSettings { steps: (steps / 3).max(3), ..SolverSettings::default() };
+                let glance = |start| {
+                    let mut problem = self.problem(first_scale);
+                    let solution = solve(&mut problem, prior, start, &settings).ok()?;
+                    Some((solution.log_evidence - problem.latest.half_log_determinant, solution))
+                };
+                // In their order, so threads do not show in the result.
+                let glances: Vec<Option<(f64, Solution)>> = starts.par_iter().map(glance).collect();
+                let seen = glances.into_iter().flatten().inspect(|(_, solution)| spent += solution.steps);
+                let best = seen.reduce(|best, other| if other.0 > best.0 { other } else { best });
+                best.ok_or(Failure::Diverged)?.1.point
             }
-            let mut problem = self.problem(first_scale);
-            let settings = SolverSettings { steps: (steps / 3).max(3), ..SolverSettings::default() };
-            let Ok(solution) = solve(&mut problem, prior, start, &settings) else {
-                continue;
-            };
-            spent += solution.steps;
-            let evidence = solution.log_evidence - problem.latest.half_log_determinant;
-            if best.as_ref().is_none_or(|(other, _)| evidence > *other) {
-                best = Some((evidence, solution.point));
-            }
-        }
-        let (_, mut point) = best.ok_or(Failure::Diverged)?;
+        };
         let mut scale = first_scale;
         let rounds = if noise_scale.is_some() { 1 } else { 2 };
         for round in 0..rounds {
