@@ -5,6 +5,7 @@
 //! evidence compares predictions of what was not learned yet.
 
 mod findings;
+mod held_out;
 mod numbers;
 mod rest;
 mod score;
@@ -24,7 +25,7 @@ use crate::model::{BatchWindow, DynamicsInput, DynamicsLearner, Hypothesis, Kine
 use crate::types::Label;
 use crate::types::posterior::{Criticism, Verdict};
 use rest::RestReadings;
-use score::scores;
+use score::{Scores, scores};
 
 /// Windows of the same joints that are looked at together at most.
 const MOST_WINDOWS: usize = 8;
@@ -148,7 +149,7 @@ impl Critic {
             let verdict = match () {
                 () if before.windows < 2 => Verdict::Insufficient,
                 () if named => Verdict::EffectFound,
-                () if !selected.rivals.is_empty() => Verdict::Unexplained,
+                () if !selected.rivals.is_empty() || leaves_much(&workshop, &selected, &after) => Verdict::Unexplained,
                 () => Verdict::Adequate,
             };
             let findings = Criticism { verdict, effects: Vec::new(), before: before.rows, after: after.rows };
@@ -220,6 +221,21 @@ impl Critic {
         };
         selections.into_iter().map(stage).collect()
     }
+}
+
+/// Residual that is no noise: κ of a joint's windows at the median, and the share of the joint's usual force.
+const MUCH: (f64, f64) = (30.0, 0.3);
+
+/// Whether a joint's residual force is large, and explained by process noise alone.
+fn leaves_much(workshop: &Workshop<'_>, selection: &Selection, scores: &Scores) -> bool {
+    scores.rows.iter().any(|row| {
+        let Some(joint) = workshop.fit.joints.iter().position(|joint| joint.child == row.label) else { return false };
+        let Some(scales) = workshop.learner.joint_scales(joint, workshop.fit) else { return false };
+        let fits = selection.components.iter().filter(|c| c.joints.contains(&joint)).filter_map(|c| c.fitted.as_ref());
+        let noise = crate::math::median(fits.flat_map(|f| &f.windows).map(|window| window.noise_scale).collect());
+        let force = row.force_rmse_n.or(row.torque_rmse_nm).unwrap_or(0.0);
+        noise.is_some_and(|scale| scale >= MUCH.0) && force >= MUCH.1 * scales.force
+    })
 }
 
 /// Beginning and end of each window \[s\].

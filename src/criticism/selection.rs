@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
+use super::held_out::HeldOut;
 use super::numbers::{Addition, Numbers, Workshop};
 use super::rest::RestReadings;
 use super::signature::{Probes, Ranked, probes, start_by_direction};
@@ -23,10 +24,14 @@ const REFITTED: usize = 5;
 const WORTH_A_REFIT: f64 = 3.0;
 /// Additions at most.
 const MOST: usize = 4;
+/// Candidates that gain enough are tried on windows left out until one holds, at most so many.
+const HELD_OUT_TRIES: usize = 3;
 /// A stop is believed from this gain on.
 const STOP_GAIN: f64 = 4.0;
 /// A pulse may be anywhere: it counts as this many candidates.
 const PLACES: f64 = 150.0;
+/// κ from which on a model is far off.
+const FAR_OFF: f64 = 1e3;
 /// κ from which on a window is not explained, and how many tables are then tried in any case.
 const MISFIT: f64 = 10.0;
 const TABLES_TRIED: usize = 4;
@@ -38,10 +43,11 @@ const KNOWN: f64 = 1e9;
 const FIRST_SCALES: [f64; 2] = [10.0, 1e3];
 /// Some candidates start with κ larger by this, too.
 const WIDENED: f64 = 30.0;
-/// A delay is tried from these \[scales\]: the motion's dependence on it is far from linear.
+/// A delay is tried from these \[scales\] and from what its signature says: the motion's dependence on it is far
+/// from linear.
 const DELAYS: [f64; 4] = [-0.8, 0.3, 1.0, 2.0];
-/// A chain whose friction is to be found, as motors' is: they report their torques with little delay.
-const SHORT_DELAYS: [f64; 2] = [-0.1, 0.1];
+/// Beside friction that is not known yet a signature says little of it: it is tried from either side of none.
+const NEAR_DELAYS: [f64; 2] = [-0.1, 0.1];
 /// A review ends at this many linearizations of all windows beyond the base model's: more windows take longer,
 /// and do not leave less time for each candidate.
 const BUDGET: usize = 350;
@@ -54,7 +60,9 @@ const GLANCE: (usize, usize) = (4, 1);
 const REFITTED_OF_CHAINS: usize = 2;
 /// Friction that was not declared starts from these shares of a joint's usual force, near what is known and far
 /// from it.
-const FRICTION_STARTS: [f64; 2] = [0.3, 0.1];
+const FRICTION_STARTS: [f64; 3] = [0.3, 0.1, 0.03];
+/// κ of the starts far from what is known.
+const WIDE_SCALES: [f64; 2] = [1e3, 1e5];
 /// What is part of something richer is added first if it explains this share of what that does.
 const SIMPLER_SHARE: f64 = 0.3;
 
@@ -273,6 +281,7 @@ impl Selector<'_> {
         let declared = self.workshop.learner.declared_mechanism();
         let friction_declared = declared.joints.iter().all(|joint| joint.friction);
         let budget = current.steps + self.budget();
+        let mut held_out = HeldOut::of(self.workshop, self.batch, &current).unwrap_or_default();
         while current.rivals.len() < MOST * declared.joints.len().max(1) {
             let (ranked, leftover) = self.ranked(&current, friction_declared)?;
             current.leftover = leftover;
@@ -314,8 +323,11 @@ impl Selector<'_> {
             if best.gain < needs(best) {
                 // A right effect can gain nothing until its partner is in.
                 match self.pair(&current, best, friction_declared, least)? {
-                    Some(pair) => {
-                        current = pair;
+                    Some(mut pair) => {
+                        if !self.holds(&mut pair, &mut held_out, &mut current.steps) {
+                            break;
+                        }
+                        current = Selection { steps: current.steps, ..pair };
                         self.settle(&mut current)?;
                         current.note_step();
                     }
@@ -323,6 +335,25 @@ impl Selector<'_> {
                 }
                 continue;
             }
+            // The next best stands in where an addition does not hold on windows left out.
+            let holding = trials
+                .iter()
+                .filter(|trial| trial.addition == best.addition && trial.also == best.also)
+                .chain(trials.iter().filter(|trial| {
+                    trial.gain > needs(trial) && !(trial.addition == best.addition && trial.also == best.also)
+                }))
+                .take(HELD_OUT_TRIES);
+            let mut taken = None;
+            for trial in holding {
+                let mut next = current.clone();
+                self.take(&mut next, trial);
+                if self.holds(&mut next, &mut held_out, &mut current.steps) {
+                    taken = Some((trial, next));
+                    break;
+                }
+                tracing::debug!(addition = ?trial.addition, "does not hold on windows left out");
+            }
+            let Some((best, next)) = taken else { break };
             let mut rivals: Vec<(Option<Addition>, f64)> = trials
                 .iter()
                 .filter(|t| t.addition != best.addition && same_place(t.addition, best.addition))
@@ -330,7 +361,7 @@ impl Selector<'_> {
                 .collect();
             rivals.push((None, -best.gain));
             let addition = best.addition;
-            self.take(&mut current, best);
+            current = Selection { steps: current.steps, declined: current.declined, leftover: current.leftover, ..next };
             current.rivals.extend(best.also.iter().map(|other| (*other, vec![(None, -best.gain)])));
             current.rivals.insert(addition, rivals);
             self.settle(&mut current)?;
@@ -338,6 +369,18 @@ impl Selector<'_> {
             current.note_step();
         }
         Ok(current)
+    }
+
+    /// Whether a model holds on windows left out against the one before it, which it then takes the place of.
+    fn holds(&self, next: &mut Selection, before: &mut HeldOut, steps: &mut usize) -> bool {
+        let Ok(after) = HeldOut::of(self.workshop, self.batch, next) else { return false };
+        *steps += after.steps;
+        tracing::debug!(additions = ?next.additions, ratios = ?after.ratios_to(before), "left out");
+        let holds = after.holds_against(before);
+        if holds {
+            *before = after;
+        }
+        holds
     }
 
     /// The model with the best candidate and the best partner of it, if the two gain enough.
@@ -391,21 +434,30 @@ impl Selector<'_> {
             (from.clone(), Ranked { start, also: also.collect(), ..candidate.clone() })
         };
         let from_both = || [current, &bland].into_iter().zip(FRICTION_STARTS);
+        // On several joints far from what is known the way is rough; with wide process noise it is smoother.
+        let wide = WIDE_SCALES.map(|scale| with_scale(&bland, scale));
+        let from_all = || from_both().chain(wide.iter().map(|from| (from, FRICTION_STARTS[2])));
         let starts: Vec<(Selection, Ranked)> = match candidate.addition {
             Addition::Delay if candidate.also.is_empty() => {
-                let motors = self.several() && !self.workshop.learner.declared().friction;
-                let delays = if motors { [SHORT_DELAYS[0], SHORT_DELAYS[1], DELAYS[1], DELAYS[2]] } else { DELAYS };
-                alone([current, &bland].into_iter().flat_map(|from| delays.map(|delay| (from, delay))).collect())
+                let delays = || DELAYS.into_iter().chain(candidate.start.first().copied());
+                alone([current, &bland].into_iter().flat_map(|from| delays().map(move |d| (from, d))).collect())
             }
-            Addition::Delay => from_both()
-                .flat_map(|(from, share)| SHORT_DELAYS.map(|delay| together(from, share, vec![delay])))
+            Addition::Delay => from_all()
+                .flat_map(|(from, share)| NEAR_DELAYS.map(|delay| together(from, share, vec![delay])))
                 .collect(),
+            Addition::Friction(joint) if !candidate.also.is_empty() => {
+                from_all().map(|(from, share)| together(from, share, friction(joint, share))).collect()
+            }
             Addition::Friction(joint) => {
                 from_both().map(|(from, share)| together(from, share, friction(joint, share))).collect()
             }
             // Far from where friction and an offset are: with wide process noise the way there is smoother.
             Addition::Effect(_, EffectKind::AsymmetricFriction) if !self.several() => {
                 [current.clone(), widened(current)].into_iter().map(|from| (from, candidate.clone())).collect()
+            }
+            // The numbers of a model that is far off mislead.
+            _ if !self.several() && self.far_off(current, candidate.addition) => {
+                [current.clone(), with_scale(&bland, FIRST_SCALES[0])].map(|from| (from, candidate.clone())).into()
             }
             _ => return self.trial(current, candidate, if self.several() { GLANCE } else { REFIT }),
         };
@@ -423,6 +475,15 @@ impl Selector<'_> {
             spent += self.refine(&mut best)?;
         }
         Ok(Trial { spent, ..best })
+    }
+
+    /// Whether most windows that an addition concerns are explained by noise.
+    fn far_off(&self, current: &Selection, addition: Addition) -> bool {
+        let concerned =
+            |c: &&Component| addition.joint().is_none_or(|joint| c.joints.contains(&joint)) && c.fitted.is_some();
+        let fits = current.components.iter().filter(concerned).filter_map(|c| c.fitted.as_ref());
+        let scales: Vec<f64> = fits.flat_map(|f| &f.windows).map(|window| window.noise_scale).collect();
+        crate::math::median(scales).is_some_and(|scale| scale >= FAR_OFF)
     }
 
     /// Whether several joints move in a window.
@@ -797,11 +858,20 @@ impl Selector<'_> {
                 best.insert(joint, (trial.gain, trial));
             }
         }
+        let mut held_out = match best.is_empty() {
+            true => HeldOut::default(),
+            false => HeldOut::of(self.workshop, self.batch, &current).unwrap_or_default(),
+        };
         for (gain, trial) in best.into_values() {
             // The layout may have changed since.
             let addition = trial.addition;
             let trial = self.trial(&current, &Ranked { addition, gain, start: Vec::new(), also: Vec::new() }, REFIT)?;
-            self.take(&mut current, &trial);
+            let mut next = current.clone();
+            self.take(&mut next, &trial);
+            if !self.holds(&mut next, &mut held_out, &mut current.steps) {
+                continue;
+            }
+            current = Selection { steps: current.steps, ..next };
             current.rivals.insert(addition, vec![(None, -trial.gain)]);
             self.drop_what_is_not_needed(&mut current, addition)?;
             current.note_step();
@@ -819,6 +889,15 @@ fn widened(selection: &Selection) -> Selection {
         }
     }
     wide
+}
+
+/// The same with this κ.
+fn with_scale(selection: &Selection, scale: f64) -> Selection {
+    let mut other = selection.clone();
+    for fitted in other.components.iter_mut().filter_map(|component| component.fitted.as_mut()) {
+        fitted.windows.iter_mut().for_each(|window| window.noise_scale = scale);
+    }
+    other
 }
 
 /// Whether a window that moves a joint needs far more process noise than the sensor explains.

@@ -1,0 +1,125 @@
+//! Windows simulated by what was learned of all the others: an addition has to hold there.
+
+use std::collections::BTreeMap;
+
+use super::numbers::Workshop;
+use super::selection::{Component, Selection};
+use crate::inference::Failure;
+use crate::math::median;
+use crate::model::{BatchWindow, Hypothesis};
+
+/// Parts that the windows of a component are left out in, at most.
+const FOLDS: usize = 4;
+/// Linearizations of a fit to the windows that are kept: it starts where all windows have it.
+const STEPS: usize = 3;
+/// Positions are simulated this far \[s\].
+const HORIZON_S: f64 = 0.5;
+/// By how much ln(force · position) may rise, of all windows and of the usual one: an addition that acts in one
+/// window only changes the others by chance.
+const SLACK: f64 = 0.05;
+
+/// Squares of what windows left out lack.
+#[derive(Clone, Debug, Default)]
+pub struct HeldOut {
+    /// By joint and window.
+    lacks: BTreeMap<usize, BTreeMap<usize, Lack>>,
+    /// Linearizations of all windows spent.
+    pub steps: usize,
+}
+
+#[derive(Clone, Copy, Debug, Default)]
+struct Lack {
+    /// \[N² s or (N·m)² s\].
+    force: f64,
+    /// \[m² or rad²\].
+    position: f64,
+}
+
+impl HeldOut {
+    /// Leaves windows out of the selected model's fit in turn.
+    pub fn of(workshop: &Workshop<'_>, batch: &[BatchWindow], selection: &Selection) -> Result<Self, Failure> {
+        let hypothesis = workshop.hypothesis(&selection.additions)?;
+        let mut all = Self::default();
+        for component in &selection.components {
+            let x = selection.numbers.laid_out(&hypothesis, &selection.additions);
+            all.add(&hypothesis, &x, component, batch)?;
+        }
+        Ok(all)
+    }
+
+    fn add(
+        &mut self,
+        hypothesis: &Hypothesis,
+        x: &[f64],
+        component: &Component,
+        batch: &[BatchWindow],
+    ) -> Result<(), Failure> {
+        let whole = component.fitted.as_ref().ok_or(Failure::NoInformation)?;
+        let folds = component.windows.len().min(FOLDS);
+        for fold in (0..folds).filter(|_| folds > 1) {
+            let (mut kept, mut scales, mut left_out) = (Vec::new(), Vec::new(), Vec::new());
+            for (k, &w) in component.windows.iter().enumerate() {
+                if k % folds == fold {
+                    left_out.push(&batch[w]);
+                } else {
+                    kept.push(&batch[w]);
+                    scales.push(whole.windows[k].noise_scale);
+                }
+            }
+            let seen = |window: &&BatchWindow| {
+                window.moving.iter().all(|joint| kept.iter().any(|other| other.moving.contains(joint)))
+            };
+            left_out.retain(seen);
+            if left_out.is_empty() {
+                continue;
+            }
+            let learned = hypothesis.fit(&kept, x, &scales, (STEPS, 0))?;
+            self.steps += learned.steps * kept.len() + left_out.len();
+            let usual = median(scales).ok_or(Failure::NoInformation)?;
+            for window in left_out {
+                let residual = hypothesis.window(window, usual).residual(&learned.x, HORIZON_S)?;
+                for (column, joint) in window.moving.iter().enumerate() {
+                    let squares = residual.forces.iter().map(|(_, span, force)| span * force[column].powi(2));
+                    let lack = Lack { force: squares.sum(), position: residual.squares[column].0 };
+                    self.lacks.entry(*joint).or_default().insert(window.index, lack);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// ln(force · position) in units of what another model leaves, of all windows and of the usual one, means of
+    /// the joints; none where nothing could be left out.
+    pub fn ratios_to(&self, before: &Self) -> Option<[f64; 2]> {
+        let mut ratios = Vec::new();
+        for (joint, own) in &self.lacks {
+            let others = before.lacks.get(joint);
+            let pairs: Vec<(Lack, Lack)> =
+                own.iter().filter_map(|(window, lack)| Some((*lack, *others?.get(window)?))).collect();
+            let sum = |side: fn(&(Lack, Lack)) -> Lack| {
+                pairs.iter().map(side).fold(Lack::default(), |sum, lack| Lack {
+                    force: sum.force + lack.force,
+                    position: sum.position + lack.position,
+                })
+            };
+            if let Some(usual) = median(pairs.iter().map(|(own, other)| own.ln_over(other)).collect()) {
+                ratios.push([sum(|pair| pair.0).ln_over(&sum(|pair| pair.1)), usual]);
+            }
+        }
+        let mean = |i: usize| ratios.iter().map(|ratio| ratio[i]).sum::<f64>() / ratios.len() as f64;
+        (!ratios.is_empty()).then(|| [mean(0), mean(1)])
+    }
+
+    /// Whether windows left out are simulated no worse than by another model.
+    pub fn holds_against(&self, before: &Self) -> bool {
+        self.ratios_to(before).is_none_or(|ratios| ratios.iter().all(|ratio| *ratio < SLACK))
+    }
+}
+
+impl Lack {
+    /// ln(force · position) in units of another's.
+    fn ln_over(&self, other: &Self) -> f64 {
+        let log = |own: f64, other: f64| 0.5 * (own.max(1e-30) / other.max(1e-30)).ln();
+        log(self.force, other.force) + log(self.position, other.position)
+    }
+}
