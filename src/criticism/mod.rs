@@ -133,6 +133,14 @@ impl Critic {
                     // What does not predict windows not yet learned better is not there.
                     Ok(found) if found.windows == 0 || found.log_predictive_density > before.log_predictive_density => {
                         after = found;
+                        // Nor is a last addition there that does not.
+                        while let Some(fewer) = selector.before_last(&selected).filter(|_| after.windows > 0)
+                            && let Ok(found) = scores(&workshop, batch, &fewer)
+                            && found.log_predictive_density > after.log_predictive_density
+                        {
+                            tracing::debug!(additions = ?selected.additions, "predicts no better than the model before it");
+                            (selected, after) = (fewer, found);
+                        }
                     }
                     _ => selected = Selection { steps: selected.steps, ..base },
                 }

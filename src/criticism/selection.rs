@@ -57,7 +57,7 @@ const SETTLING: (usize, f64) = (3, 1.0);
 const REFIT: (usize, usize) = (8, 2);
 /// Where several joints move, candidates are first fitted as little as this, and the best few refitted.
 const GLANCE: (usize, usize) = (4, 1);
-const REFITTED_OF_CHAINS: usize = 2;
+const REFITTED_OF_CHAINS: usize = 3;
 /// Friction that was not declared starts from these shares of a joint's usual force, near what is known and far
 /// from it.
 const FRICTION_STARTS: [f64; 3] = [0.3, 0.1, 0.03];
@@ -152,6 +152,7 @@ pub struct Selector<'a> {
 }
 
 /// A refitted candidate.
+#[derive(Clone)]
 struct Trial {
     addition: Addition,
     also: Vec<Addition>,
@@ -162,6 +163,25 @@ struct Trial {
     spent: usize,
     hypothesis: Hypothesis,
     fits: Vec<(Vec<usize>, BatchFit)>,
+}
+
+impl Trial {
+    /// Variance and correlation of its innovations beyond what they should be, of the usual window.
+    fn reduction(&self) -> f64 {
+        let windows = self.fits.iter().flat_map(|(_, fitted)| &fitted.windows);
+        crate::math::median(windows.map(|window| window.reduction).collect()).unwrap_or(1.0)
+    }
+
+    /// How many numbers it adds.
+    fn numbers(&self) -> usize {
+        let of = |addition: &Addition| match *addition {
+            Addition::Effect(_, kind) => kind.parameters().len(),
+            Addition::Bias => 6,
+            Addition::Table(..) => usize::MAX / 2,
+            Addition::Stop(..) | Addition::Friction(_) | Addition::Delay => 1,
+        };
+        of(&self.addition) + self.also.iter().map(of).sum::<usize>()
+    }
 }
 
 impl Selector<'_> {
@@ -282,6 +302,7 @@ impl Selector<'_> {
         let friction_declared = declared.joints.iter().all(|joint| joint.friction);
         let budget = current.steps + self.budget();
         let mut held_out = HeldOut::of(self.workshop, self.batch, &current).unwrap_or_default();
+        let mut richer: Option<(f64, Trial)> = None;
         while current.rivals.len() < MOST * declared.joints.len().max(1) {
             let (ranked, leftover) = self.ranked(&current, friction_declared)?;
             current.leftover = leftover;
@@ -302,6 +323,14 @@ impl Selector<'_> {
                 }
             }
             let by_gain = |a: &Trial, b: &Trial| b.gain.total_cmp(&a.gain).then(a.addition.cmp(&b.addition));
+            // What had all of the part that was taken, and more, need not be found again.
+            if let Some((log_evidence, trial)) = richer.take()
+                && trial.additions.is_superset(&current.additions)
+                && trial.additions.len() == current.additions.len() + 1
+            {
+                let gain = log_evidence - current.log_evidence;
+                trials.push(Trial { gain, also: Vec::new(), ..trial });
+            }
             trials.sort_by(by_gain);
             if self.several() {
                 for trial in trials.iter_mut().take(REFITTED_OF_CHAINS) {
@@ -319,14 +348,18 @@ impl Selector<'_> {
             let Some(best) = trials.iter().find(|trial| trial.gain > needs(trial)).or(trials.first()) else { break };
             let part_of_it =
                 |trial: &&Trial| trial.gain > needs(trial).max(SIMPLER_SHARE * best.gain) && is_part_of(trial, best);
-            let best = trials.iter().find(part_of_it).unwrap_or(best);
+            let simple = trials.iter().find(part_of_it);
+            // On a chain what one joint lacks shows in the others: of those that evidence hardly tells apart the one
+            // with the fewest numbers; where innovations are not white, fewer of them count.
+            let apart = if self.several() { LEAST_GAIN * best.reduction() } else { 0.0 };
+            let near = trials.iter().filter(|trial| trial.gain > needs(trial).max(best.gain - apart));
+            let best = simple.or_else(|| near.min_by_key(|trial| trial.numbers())).unwrap_or(best);
             if best.gain < needs(best) {
                 // A right effect can gain nothing until its partner is in.
                 match self.pair(&current, best, friction_declared, least)? {
-                    Some(mut pair) => {
-                        if !self.holds(&mut pair, &mut held_out, &mut current.steps) {
-                            break;
-                        }
+                    Some(pair) => {
+                        let Some(after) = self.holding(&pair, &held_out, &mut current.steps) else { break };
+                        held_out = after;
                         current = Selection { steps: current.steps, ..pair };
                         self.settle(&mut current)?;
                         current.note_step();
@@ -336,24 +369,20 @@ impl Selector<'_> {
                 continue;
             }
             // The next best stands in where an addition does not hold on windows left out.
-            let holding = trials
-                .iter()
-                .filter(|trial| trial.addition == best.addition && trial.also == best.also)
-                .chain(trials.iter().filter(|trial| {
-                    trial.gain > needs(trial) && !(trial.addition == best.addition && trial.also == best.also)
-                }))
-                .take(HELD_OUT_TRIES);
+            let others = trials.iter().filter(|trial| trial.gain > needs(trial) && !std::ptr::eq(*trial, best));
             let mut taken = None;
-            for trial in holding {
+            for trial in std::iter::once(best).chain(others).take(HELD_OUT_TRIES) {
                 let mut next = current.clone();
                 self.take(&mut next, trial);
-                if self.holds(&mut next, &mut held_out, &mut current.steps) {
-                    taken = Some((trial, next));
+                if let Some(after) = self.holding(&next, &held_out, &mut current.steps) {
+                    taken = Some((trial, next, after));
                     break;
                 }
-                tracing::debug!(addition = ?trial.addition, "does not hold on windows left out");
             }
-            let Some((best, next)) = taken else { break };
+            let Some((best, next, after)) = taken else { break };
+            held_out = after;
+            let whole = trials.iter().find(|trial| trial.gain > best.gain && is_part_of(best, trial));
+            let whole = whole.map(|trial| (current.log_evidence + trial.gain, trial.clone()));
             let mut rivals: Vec<(Option<Addition>, f64)> = trials
                 .iter()
                 .filter(|t| t.addition != best.addition && same_place(t.addition, best.addition))
@@ -361,26 +390,25 @@ impl Selector<'_> {
                 .collect();
             rivals.push((None, -best.gain));
             let addition = best.addition;
-            current = Selection { steps: current.steps, declined: current.declined, leftover: current.leftover, ..next };
+            current =
+                Selection { steps: current.steps, declined: current.declined, leftover: current.leftover, ..next };
             current.rivals.extend(best.also.iter().map(|other| (*other, vec![(None, -best.gain)])));
             current.rivals.insert(addition, rivals);
             self.settle(&mut current)?;
             self.drop_what_is_not_needed(&mut current, addition)?;
             current.note_step();
+            richer = whole;
         }
         Ok(current)
     }
 
-    /// Whether a model holds on windows left out against the one before it, which it then takes the place of.
-    fn holds(&self, next: &mut Selection, before: &mut HeldOut, steps: &mut usize) -> bool {
-        let Ok(after) = HeldOut::of(self.workshop, self.batch, next) else { return false };
+    /// What windows left out lack by a model; none where it does not hold there against the one before it.
+    fn holding(&self, next: &Selection, before: &HeldOut, steps: &mut usize) -> Option<HeldOut> {
+        let after = HeldOut::of(self.workshop, self.batch, next).ok()?;
         *steps += after.steps;
-        tracing::debug!(additions = ?next.additions, ratios = ?after.ratios_to(before), "left out");
-        let holds = after.holds_against(before);
-        if holds {
-            *before = after;
-        }
-        holds
+        let ratios = after.ratios_to(before);
+        tracing::debug!(additions = ?next.additions, ?ratios, "left out");
+        after.holds_against(before).then_some(after)
     }
 
     /// The model with the best candidate and the best partner of it, if the two gain enough.
@@ -456,7 +484,7 @@ impl Selector<'_> {
                 [current.clone(), widened(current)].into_iter().map(|from| (from, candidate.clone())).collect()
             }
             // The numbers of a model that is far off mislead.
-            _ if !self.several() && self.far_off(current, candidate.addition) => {
+            _ if !self.several() && self.noise(current, candidate.addition) >= FAR_OFF => {
                 [current.clone(), with_scale(&bland, FIRST_SCALES[0])].map(|from| (from, candidate.clone())).into()
             }
             _ => return self.trial(current, candidate, if self.several() { GLANCE } else { REFIT }),
@@ -477,13 +505,13 @@ impl Selector<'_> {
         Ok(Trial { spent, ..best })
     }
 
-    /// Whether most windows that an addition concerns are explained by noise.
-    fn far_off(&self, current: &Selection, addition: Addition) -> bool {
+    /// κ of the windows that an addition concerns, at the median.
+    fn noise(&self, current: &Selection, addition: Addition) -> f64 {
         let concerned =
             |c: &&Component| addition.joint().is_none_or(|joint| c.joints.contains(&joint)) && c.fitted.is_some();
         let fits = current.components.iter().filter(concerned).filter_map(|c| c.fitted.as_ref());
         let scales: Vec<f64> = fits.flat_map(|f| &f.windows).map(|window| window.noise_scale).collect();
-        crate::math::median(scales).is_some_and(|scale| scale >= FAR_OFF)
+        crate::math::median(scales).unwrap_or(1.0)
     }
 
     /// Whether several joints move in a window.
@@ -556,7 +584,9 @@ impl Selector<'_> {
                 .collect();
             let concerned = windows.iter().any(|w| Some(w.index) == newest);
             let known = self.found.iter().filter(|a| a.joint().is_none_or(|joint| moved.contains(&joint)));
-            let known = known.filter(|a| !current.additions.contains(a) && !matches!(a, Addition::Stop(..)));
+            // A table may stand for anything: it describes what is left where nothing with a name does.
+            let named = |a: &&Addition| !matches!(a, Addition::Stop(..) | Addition::Table(..));
+            let known = known.filter(|a| !current.additions.contains(a)).filter(named);
             for addition in known.copied() {
                 let start = current.numbers.added.get(&addition).cloned().unwrap_or_default();
                 ranked.push(Ranked { addition, gain: KNOWN, start, also: Vec::new() });
@@ -832,6 +862,28 @@ impl Selector<'_> {
         gains.collect()
     }
 
+    /// The model before the last addition, fitted anew; none where what was added took the place of something.
+    pub fn before_last(&self, selected: &Selection) -> Option<Selection> {
+        let [earlier @ .., before, _] = &selected.stages[..] else { return None };
+        let known = |a: &Addition| matches!(a, Addition::Stop(..)) || selected.rivals.contains_key(a);
+        if !before.additions.iter().all(known) {
+            return None;
+        }
+        let starts = [&before.numbers, &selected.numbers];
+        let fits = starts.into_iter().filter_map(|start| self.fitted(&before.additions, start, REFIT).ok());
+        let fitted = fits.max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence))?;
+        let mut rivals = selected.rivals.clone();
+        rivals.retain(|addition, _| before.additions.contains(addition));
+        Some(Selection {
+            rivals,
+            stages: earlier.iter().chain([before]).cloned().collect(),
+            declined: selected.declined.clone(),
+            leftover: selected.leftover.clone(),
+            steps: selected.steps + fitted.steps,
+            ..fitted
+        })
+    }
+
     /// Adds the tables that what is left calls for; the named ones that then gain nothing go.
     pub fn describe_leftover(&self, mut current: Selection) -> Result<Selection, Failure> {
         let leftover = current.leftover.clone();
@@ -868,9 +920,8 @@ impl Selector<'_> {
             let trial = self.trial(&current, &Ranked { addition, gain, start: Vec::new(), also: Vec::new() }, REFIT)?;
             let mut next = current.clone();
             self.take(&mut next, &trial);
-            if !self.holds(&mut next, &mut held_out, &mut current.steps) {
-                continue;
-            }
+            let Some(after) = self.holding(&next, &held_out, &mut current.steps) else { continue };
+            held_out = after;
             current = Selection { steps: current.steps, ..next };
             current.rivals.insert(addition, vec![(None, -trial.gain)]);
             self.drop_what_is_not_needed(&mut current, addition)?;
