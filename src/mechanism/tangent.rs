@@ -193,9 +193,8 @@ fn step_with_slopes(
             let by_acceleration = by(JointState { acceleration: joint.acceleration + DIFFERENCE, ..joint });
             for c in 0..right.ncols() {
                 let faster = (slopes.rates[(k, c)] - slopes.before[(k, c)]) / h;
-                right[(k, c)] += by_position * middle.positions[(k, c)]
-                    + by_rate * middle.rates[(k, c)]
-                    + by_acceleration * faster;
+                right[(k, c)] +=
+                    by_position * middle.positions[(k, c)] + by_rate * middle.rates[(k, c)] + by_acceleration * faster;
             }
         }
         for (c, parameter) in parameters.iter().enumerate().filter(|(_, parameter)| parameter.joints.contains(&k)) {
@@ -405,8 +404,7 @@ impl InverseDynamics {
             let ([momentum, driving], along) = (momenta[k], own.displacement);
             let seen = |of: &Spatial<f64>, value: Spatial<f64>| value + along.cross_motion(of) * -1.0;
             let inertia = &plain.inertias[k];
-            let momentum_slope =
-                inertia.momentum(&seen(&plain.twists[k], own.twist)) + along.cross_force(&momentum);
+            let momentum_slope = inertia.momentum(&seen(&plain.twists[k], own.twist)) + along.cross_force(&momentum);
             own.force = inertia.momentum(&seen(&spatial[k], own.acceleration))
                 + along.cross_force(&driving)
                 + own.twist.cross_force(&momentum)
@@ -529,8 +527,7 @@ mod tests {
         let step = 1e-6;
         let numeric = DMatrix::from_fn(6, PARAMETERS + 6, |i, c| (run(c, step)[i] - run(c, -step)[i]) / (2.0 * step));
         let plain = tree(x, &[0.0; PARAMETERS], stop, fork);
-        let parameters: Vec<TreeSlope> =
-            (0..PARAMETERS).map(|c| TreeSlope::new(&plain, by(c, step).0, step)).collect();
+        let parameters: Vec<TreeSlope> = (0..PARAMETERS).map(|c| TreeSlope::new(&plain, by(c, step).0, step)).collect();
         let first = |at: usize| DMatrix::from_fn(3, PARAMETERS + 6, |k, c| f64::from(c == at + k));
         let mut slopes = StateSlopes::new(first(PARAMETERS), first(PARAMETERS + 3));
         let mut workspace = TangentWorkspace::new(&plain);

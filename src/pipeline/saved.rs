@@ -128,7 +128,7 @@ impl Pipeline {
             gravity_in_world: self.settings.gravity_in_world,
             zero: self.zero?,
             newest: self.newest?,
-            learner: Arc::clone(self.learner.as_ref()?),
+            learner: Arc::clone(self.known()?),
         })
     }
 
@@ -177,8 +177,8 @@ impl Pipeline {
         let unknown: Vec<Label> = unknown.copied().collect();
         self.current = learner.displacements.clone();
         self.newcomers = (!unknown.is_empty()).then(Vec::new);
-        if let Some(backlog) = &mut self.backlog {
-            backlog.forecaster.resumed(&learner, frame.time_s, positions);
+        if let Some(forecaster) = self.backlog.as_mut().and_then(|backlog| backlog.forecaster.as_mut()) {
+            forecaster.resumed(&learner, frame.time_s, positions);
         }
         let root = learner.root;
         self.learner = Some(Arc::new(learner));
