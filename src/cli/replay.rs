@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use anyhow::{Context, bail};
 use bayesian_object_models::{
@@ -115,10 +115,10 @@ fn now() -> Instant {
     Instant::now()
 }
 
-/// Since it was first asked.
-fn clock() -> Duration {
+/// Seconds since it was first asked.
+fn clock() -> f64 {
     static BEGIN: LazyLock<Instant> = LazyLock::new(now);
-    BEGIN.elapsed()
+    BEGIN.elapsed().as_secs_f64()
 }
 
 /// The files that a replay writes.
@@ -201,7 +201,7 @@ struct Replay {
     /// Earliest and latest stamp.
     span: Option<(Stamp, Stamp)>,
     /// Of each window's learning, in order.
-    inference_wall: Vec<Duration>,
+    inference_wall_s: Vec<f64>,
     /// For the report.
     gatherer: Option<Gatherer>,
     /// Lines for the table.
@@ -238,7 +238,7 @@ impl Replay {
             hash: BagHash::default(),
             seen: BTreeSet::new(),
             span: None,
-            inference_wall: Vec::new(),
+            inference_wall_s: Vec::new(),
             gatherer: arguments.report.is_some().then(Gatherer::default),
             remarks: Vec::new(),
         })
@@ -259,7 +259,7 @@ impl Replay {
                 self.push(input, outputs)?;
             }
             progress.at(bag.bytes_read());
-            progress.say(format!("{} windows", self.inference_wall.len()));
+            progress.say(format!("{} windows", self.inference_wall_s.len()));
         }
         for input in self.ingest.flush() {
             self.push(input, outputs)?;
@@ -315,8 +315,8 @@ impl Replay {
             }
             // A replay learns in the stream.
             Output::FirstLook(_) | Output::WindowClosed(_) | Output::Tracked { .. } => {}
-            Output::Learned { span_s, wall } => {
-                self.inference_wall.push(*wall);
+            Output::Learned { span_s, wall_s } => {
+                self.inference_wall_s.push(*wall_s);
                 tracing::info!(from_s = span_s.0, to_s = span_s.1, "window learned");
             }
             Output::Resumed { root, unexplained, unknown } => self.taken_up(*root, unexplained, unknown)?,
@@ -354,9 +354,9 @@ impl Replay {
             bail!("{bag_name}: --root-label {root}: no such part, seen were {}", seen.join(", "));
         }
         // Those of a loaded model come first; what they took is not known any more.
-        let loaded = posterior.windows.len().saturating_sub(self.inference_wall.len());
-        for (window, wall) in posterior.windows.iter_mut().skip(loaded).zip(&self.inference_wall) {
-            window.inference_wall_s = wall.as_secs_f64();
+        let loaded = posterior.windows.len().saturating_sub(self.inference_wall_s.len());
+        for (window, wall_s) in posterior.windows.iter_mut().skip(loaded).zip(&self.inference_wall_s) {
+            window.inference_wall_s = *wall_s;
         }
         Ok(PosteriorDocument::new(posterior, counters))
     }

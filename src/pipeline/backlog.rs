@@ -6,7 +6,6 @@
 
 use std::collections::VecDeque;
 use std::sync::Arc;
-use std::time::Duration;
 
 use super::forecast::{Forecaster, mechanism_of};
 use super::rest::RestReading;
@@ -46,8 +45,8 @@ pub(super) struct Lesson {
     pub job: WindowJob,
     /// What was touched in it.
     pub contacts: Vec<Contact>,
-    /// What its motion took.
-    pub wall: Duration,
+    /// What its motion took \[s\].
+    pub wall_s: f64,
     /// By which to time the rest.
     pub clock: Clock,
 }
@@ -55,15 +54,15 @@ pub(super) struct Lesson {
 impl Lesson {
     /// Learns the physics on from those of the windows before.
     fn finish(self, before: Option<&Learner>) -> (Arc<Learner>, Output) {
-        let Self { mut learner, job, contacts, wall, clock } = self;
+        let Self { mut learner, job, contacts, wall_s, clock } = self;
         let begin = clock();
         if let Some(before) = before {
             learner.take_physics_of(before);
         }
         learner.learn_physics(&job, &contacts);
         learner.retire();
-        let wall = wall + clock().saturating_sub(begin);
-        (Arc::new(learner), Output::Learned { span_s: job.span_s(), wall })
+        let wall_s = wall_s + clock() - begin;
+        (Arc::new(learner), Output::Learned { span_s: job.span_s(), wall_s })
     }
 }
 

@@ -22,7 +22,6 @@ mod working_frame;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
-use std::time::Duration;
 
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
@@ -145,13 +144,13 @@ pub enum Output {
     Learned {
         /// Seconds since time zero of its first and last frame.
         span_s: (f64, f64),
-        /// What it took by the pipeline's clock.
-        wall: Duration,
+        /// What it took by the pipeline's clock \[s\].
+        wall_s: f64,
     },
 }
 
-/// The time from an arbitrary zero.
-pub type Clock = fn() -> Duration;
+/// Seconds since an arbitrary zero.
+pub type Clock = fn() -> f64;
 
 /// From inputs to outputs; the same for a recorded and a live stream.
 pub struct Pipeline {
@@ -198,7 +197,7 @@ impl Pipeline {
         let backlog = (settings.predict || may_lag).then(|| Backlog::new(forecaster, may_lag));
         Self {
             backlog,
-            clock: || Duration::ZERO,
+            clock: || 0.0,
             poses: PoseBuffer::new(settings.poses),
             last_frame_s: None,
             settings,
@@ -437,13 +436,13 @@ impl Pipeline {
         let learn = || {
             let begin = clock();
             let contacts = learning.learn_motion(&job);
-            (contacts, clock().saturating_sub(begin))
+            (contacts, clock() - begin)
         };
         let catch_up = || backlog.as_mut().map_or_else(Vec::new, Backlog::catch_up);
-        let ((contacts, wall), mut outputs) = rayon::join(learn, catch_up);
+        let ((contacts, wall_s), mut outputs) = rayon::join(learn, catch_up);
         self.current.extend(learning.displacements.iter().map(|(l, d)| (*l, *d)));
         if let Some(backlog) = backlog.as_mut().filter(|backlog| backlog.may_lag()) {
-            let lesson = Lesson { learner: learning.clone(), job, contacts, wall, clock };
+            let lesson = Lesson { learner: learning.clone(), job, contacts, wall_s, clock };
             learning.retire();
             outputs.extend(backlog.push(News::Lesson(Box::new(lesson))));
             return outputs;
@@ -451,7 +450,7 @@ impl Pipeline {
         let begin = clock();
         learning.learn_physics(&job, &contacts);
         learning.retire();
-        outputs.push(Output::Learned { span_s: job.span_s(), wall: wall + clock().saturating_sub(begin) });
+        outputs.push(Output::Learned { span_s: job.span_s(), wall_s: wall_s + clock() - begin });
         if let Some(backlog) = backlog {
             outputs.extend(backlog.push(News::Learned(Arc::clone(learner))));
         }
@@ -478,7 +477,7 @@ impl Pipeline {
         if let Some(forecaster) = self.backlog.as_mut().and_then(|backlog| backlog.forecaster.as_mut()) {
             forecaster.learned(&learned.learner, learned.mechanism.clone(), Some(&self.current));
         }
-        Output::Learned { span_s: learned.span_s, wall: Duration::ZERO }
+        Output::Learned { span_s: learned.span_s, wall_s: 0.0 }
     }
 
     /// Registers every part of a frame, from where it was.
