@@ -14,6 +14,9 @@ pub const OUTLIER_COST: f64 = 4.5;
 /// Surfels are this far apart \[m\]: a point further off along the surface lies beyond a boundary.
 const BOUNDARY_SLACK: f64 = 0.012;
 
+/// A part's other side is at most this far behind a face \[m\].
+const THICKNESS: f64 = 0.040;
+
 /// How scans are matched.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AlignmentSettings {
@@ -165,15 +168,29 @@ pub fn truncated_cost(model: &PartModel, scan: &[ScanPoint], stride: usize, disp
     for scan_point in scan.iter().step_by(stride.max(1)) {
         count += 1.0;
         let y = reference_from_world.transform_point(&scan_point.point_in_world);
-        cost += matching_surfel(model, scan_point, &y, &reference_from_world).map_or(OUTLIER_COST, |index| {
-            let surfel = &model.surfels[index];
-            let offset = y - surfel.point;
-            let e = surfel.normal.dot(&offset);
-            let along = ((offset - surfel.normal * e).norm() - BOUNDARY_SLACK).max(0.0);
-            (0.5 * (e / surfel.sigma).powi(2) + 0.5 * (along / 0.010).powi(2)).min(OUTLIER_COST)
-        });
+        let index = matching_surfel(model, scan_point, &y, &reference_from_world);
+        let Some((surfel, turned_away)) = index.map(|index| (&model.surfels[index], false)).or_else(|| {
+            let behind = model.field.nearest(&y)[0]?;
+            Some((&model.surfels[behind as usize], true))
+        }) else {
+            cost += OUTLIER_COST;
+            continue;
+        };
+        let offset = y - surfel.point;
+        let e = surfel.normal.dot(&offset);
+        let along = ((offset - surfel.normal * e).norm() - BOUNDARY_SLACK).max(0.0);
+        let beyond = 0.5 * (along / 0.010).powi(2);
+        let height = if turned_away { back_cost(e, surfel.sigma) } else { 0.5 * (e / surfel.sigma).powi(2) };
+        cost += (height + beyond).min(OUTLIER_COST);
     }
     if count > 0.0 { cost / count } else { 0.0 }
+}
+
+/// Cost of a point seen from behind a face at a height over it \[m\]: on the part's other side, which was
+/// not seen yet, anywhere within its thickness; nothing is seen through a face.
+fn back_cost(height: f64, sigma: f64) -> f64 {
+    let anywhere = (THICKNESS / (sigma * std::f64::consts::TAU.sqrt())).ln().max(0.0);
+    anywhere + 0.5 * (height.max(-THICKNESS - height).max(0.0) / sigma).powi(2)
 }
 
 /// The nearest surfel that faces the sensor, if any is in reach.
