@@ -20,6 +20,8 @@ const NOISE_SCALES: [f64; 6] = [1.0, 3.0, 10.0, 30.0, 100.0, 300.0];
 const LOG_NOISE_DEVIATION: f64 = 1.5;
 /// Weight, in innovations, of the prior that innovations have unit variance.
 const VARIANCE_PRIOR: f64 = 10.0;
+/// Half a deviation of a kinematic number changes innovations by this much at most, root mean square.
+const RUNAWAY: f64 = 30.0;
 /// A stuck joint's load is known to this share: friction below the load is unlikelier than that.
 const LOAD_DEVIATION: f64 = 0.1;
 
@@ -225,25 +227,27 @@ impl WindowFit<'_> {
             return result;
         };
         for (column, deviation) in deviations.iter().enumerate().filter(|(_, d)| **d > 0.0) {
-            let step = 0.5 * deviation;
-            let kinematics = self.moved(column, step);
-            let Some(track) = joint_track(&self.source, &kinematics) else {
-                continue;
-            };
-            let model = WindowModel { axes: &kinematics.axes, track: &track, ..self.model(fitted.noise_scale) };
-            let Ok(residuals) = model.residuals(&x, &fitted.innovations.gains) else {
-                continue;
-            };
-            if residuals.len() != fitted.innovations.whitened.len() {
-                continue;
-            }
-            let slope = DVector::from_iterator(
-                residuals.len(),
-                residuals.iter().zip(&fitted.innovations.whitened).map(|(a, b)| (a - b) / step),
-            );
+            // A difference that runs away (with the gains held, on the other side of a stop) is no slope.
+            let slope = [0.5, 0.05, 0.005].into_iter().find_map(|share| {
+                let step = share * deviation;
+                let change = self.change(&x, fitted, column, step)?;
+                (change.norm() < RUNAWAY * (change.len() as f64).sqrt()).then(|| change / step)
+            });
+            let Some(slope) = slope else { continue };
             result.set_column(column, &cholesky.solve(&(jacobian.transpose() * slope)));
         }
         result
+    }
+
+    /// By how much the innovations change at the same numbers and gains where one kinematic number is moved.
+    fn change(&self, x: &[f64], fitted: &FittedWindow, column: usize, step: f64) -> Option<DVector<f64>> {
+        let kinematics = self.moved(column, step);
+        let track = joint_track(&self.source, &kinematics)?;
+        let model = WindowModel { axes: &kinematics.axes, track: &track, ..self.model(fitted.noise_scale) };
+        let residuals = model.residuals(x, &fitted.innovations.gains).ok()?;
+        let before = &fitted.innovations.whitened;
+        let change = || residuals.iter().zip(before).map(|(after, before)| after - before);
+        (residuals.len() == before.len()).then(|| DVector::from_iterator(before.len(), change()))
     }
 
     /// The kinematics with one number moved: axis parameters joint by joint, then the tool's offset.
