@@ -155,33 +155,51 @@ pub fn pose_factor(
 /// Points of a scan that [`thinned_cost`] looks at, about.
 const COST_POINTS: usize = 150;
 
+/// What a point is that is seen from behind the face nearest to it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FromBehind {
+    /// It matches nothing: a pose that is free to move might pass all points for such.
+    Outlier,
+    /// It lies on the part's other side, which was not seen before: for motions of one degree of freedom.
+    OtherSide,
+}
+
 /// [`truncated_cost`] by a few points of a scan: poses are compared with it all the time.
 pub fn thinned_cost(model: &PartModel, scan: &[ScanPoint], displacement: &Pose) -> f64 {
-    truncated_cost(model, scan, scan.len() / COST_POINTS, displacement)
+    truncated_cost(model, scan, scan.len() / COST_POINTS, displacement, FromBehind::Outlier)
+}
+
+/// [`thinned_cost`] on a motion whose other poses show the same: the part's other side may come into view.
+pub fn motion_cost(model: &PartModel, scan: &[ScanPoint], displacement: &Pose) -> f64 {
+    truncated_cost(model, scan, scan.len() / COST_POINTS, displacement, FromBehind::OtherSide)
 }
 
 /// Mean truncated cost per point, between 0 and `OUTLIER_COST`: for comparing far-apart poses.
-pub fn truncated_cost(model: &PartModel, scan: &[ScanPoint], stride: usize, displacement: &Pose) -> f64 {
+pub fn truncated_cost(
+    model: &PartModel,
+    scan: &[ScanPoint],
+    stride: usize,
+    displacement: &Pose,
+    from_behind: FromBehind,
+) -> f64 {
     let reference_from_world = displacement.inverse();
     let mut cost = 0.0;
     let mut count = 0.0;
     for scan_point in scan.iter().step_by(stride.max(1)) {
         count += 1.0;
         let y = reference_from_world.transform_point(&scan_point.point_in_world);
-        let index = matching_surfel(model, scan_point, &y, &reference_from_world);
-        let Some((surfel, turned_away)) = index.map(|index| (&model.surfels[index], false)).or_else(|| {
-            let behind = model.field.nearest(&y)[0]?;
-            Some((&model.surfels[behind as usize], true))
-        }) else {
+        let facing = matching_surfel(model, scan_point, &y, &reference_from_world);
+        let behind = || model.field.nearest(&y)[0].filter(|_| from_behind == FromBehind::OtherSide);
+        let Some(index) = facing.or_else(|| behind().map(|index| index as usize)) else {
             cost += OUTLIER_COST;
             continue;
         };
+        let surfel = &model.surfels[index];
         let offset = y - surfel.point;
         let e = surfel.normal.dot(&offset);
         let along = ((offset - surfel.normal * e).norm() - BOUNDARY_SLACK).max(0.0);
-        let beyond = 0.5 * (along / 0.010).powi(2);
-        let height = if turned_away { back_cost(e, surfel.sigma) } else { 0.5 * (e / surfel.sigma).powi(2) };
-        cost += (height + beyond).min(OUTLIER_COST);
+        let height = if facing.is_some() { 0.5 * (e / surfel.sigma).powi(2) } else { back_cost(e, surfel.sigma) };
+        cost += (height + 0.5 * (along / 0.010).powi(2)).min(OUTLIER_COST);
     }
     if count > 0.0 { cost / count } else { 0.0 }
 }
