@@ -246,3 +246,52 @@ fn add_residual(
     face.gradient += jacobian * (weight * e);
     0.5 * (freedom + 1.0) * (normalized * normalized / freedom).ln_1p()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::math::Screw;
+    use crate::registration::SurfelAccumulator;
+
+    /// A lid of 30 cm × 30 cm × 12 mm hinged at x = 0, as a sensor in front of it and above sees it at an angle.
+    fn scan_of_lid(screw: &Screw, angle: f64) -> Vec<ScanPoint> {
+        let eye = Vector3::new(1.2, 0.0, 0.4);
+        let lid = screw.displacement(angle);
+        let eye_at_lid = lid.inverse().transform_point(&eye);
+        let height = if eye_at_lid.z > 0.0 { 0.006 } else { -0.006 };
+        let cell = |i: i32| (f64::from(i % 31) * 0.01, f64::from(i / 31) * 0.01 - 0.15);
+        (0..31 * 31)
+            .map(|i| ScanPoint {
+                point_in_world: lid.transform_point(&Vector3::new(cell(i).0, cell(i).1, height)),
+                viewpoint_in_world: Some(eye),
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_lid_that_shows_its_underside_is_found_open() {
+        let hinge = Screw::revolute(&-Vector3::y(), &Vector3::zeros());
+        let mut accumulator = SurfelAccumulator::default();
+        for _ in 0..3 {
+            accumulator.add(&scan_of_lid(&hinge, 0.0), &Pose::identity());
+        }
+        let model = PartModel::new(&accumulator.surfels()).expect("enough surfels");
+        let scan = scan_of_lid(&hinge, 1.0);
+        assert!(thinned_cost(&model, &scan, &hinge.displacement(1.0)) > 0.9 * OUTLIER_COST, "nothing known is seen");
+        let open = motion_cost(&model, &scan, &hinge.displacement(1.0));
+        assert!(open < 0.8 * OUTLIER_COST, "{open}");
+        let slide = Screw::prismatic(&Vector3::z());
+        for elsewhere in [Pose::identity(), hinge.displacement(0.5), hinge.displacement(1.4), slide.displacement(0.12)]
+        {
+            let cost = motion_cost(&model, &scan, &elsewhere);
+            assert!(cost > open + 0.3, "{cost} against {open}");
+        }
+    }
+
+    #[test]
+    fn nothing_is_seen_through_a_face() {
+        assert!(back_cost(0.010, 0.002) > OUTLIER_COST);
+        assert!(back_cost(-THICKNESS - 0.010, 0.002) > OUTLIER_COST);
+        assert!(back_cost(-0.012, 0.002) < OUTLIER_COST);
+    }
+}

@@ -227,12 +227,7 @@ impl WindowFit<'_> {
             return result;
         };
         for (column, deviation) in deviations.iter().enumerate().filter(|(_, d)| **d > 0.0) {
-            // A difference that runs away (with the gains held, on the other side of a stop) is no slope.
-            let slope = [0.5, 0.05, 0.005].into_iter().find_map(|share| {
-                let step = share * deviation;
-                let change = self.change(&x, fitted, column, step)?;
-                (change.norm() < RUNAWAY * (change.len() as f64).sqrt()).then(|| change / step)
-            });
+            let slope = settled_slope(*deviation, |step| self.change(&x, fitted, column, step));
             let Some(slope) = slope else { continue };
             result.set_column(column, &cholesky.solve(&(jacobian.transpose() * slope)));
         }
@@ -265,6 +260,16 @@ impl WindowFit<'_> {
         moved.tool_offset[at] += step;
         moved
     }
+}
+
+/// The slope of a change by the difference over half a deviation. A difference that runs away (with the gains
+/// held, on the other side of a stop) is none: then it is taken over less, and `None` where that runs away too.
+fn settled_slope(deviation: f64, change: impl Fn(f64) -> Option<DVector<f64>>) -> Option<DVector<f64>> {
+    [0.5, 0.05, 0.005].into_iter().find_map(|share| {
+        let step = share * deviation;
+        let change = change(step)?;
+        (change.norm() < RUNAWAY * (change.len() as f64).sqrt()).then(|| change / step)
+    })
 }
 
 /// An axis moved along one of its four directions; see the kinematic fit.
@@ -342,4 +347,20 @@ pub fn load_factor(log_load: f64, mean: f64, deviation: f64, size: usize) -> Gau
         gaussian.information[FRICTION] = matched / variance - mean / (deviation * deviation);
     }
     gaussian
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_difference_that_runs_away_is_no_slope() {
+        let beyond = |limit: f64| {
+            move |step: f64| Some(DVector::from_element(4, if step < limit { 3.0 * step } else { f64::INFINITY }))
+        };
+        let slope = |limit: f64| settled_slope(0.2, beyond(limit)).map(|slope| slope[0]);
+        assert!(slope(1.0).is_some_and(|slope| (slope - 3.0).abs() < 1e-12));
+        assert!(slope(0.05).is_some_and(|slope| (slope - 3.0).abs() < 1e-12));
+        assert_eq!(slope(0.0), None);
+    }
 }
