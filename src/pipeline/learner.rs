@@ -21,7 +21,8 @@ use crate::model::{
 };
 use crate::model::{DynamicsInput, DynamicsLearner, DynamicsPosterior, WindowInference};
 use crate::registration::{
-    AlignmentSettings, PartModel, ScanPoint, Surfel, SurfelAccumulator, fit_circle, fit_line, rays_near, thinned_cost,
+    AlignmentSettings, PartModel, ScanPoint, Surfel, SurfelAccumulator, fit_circle, fit_line, motion_cost, rays_near,
+    thinned_cost,
 };
 use crate::structure::TreeDistribution;
 use crate::types::posterior::WindowRecord;
@@ -340,11 +341,14 @@ impl Learner {
                 continue;
             }
             let count = scans.len() as f64;
-            let cost = |scan: &&Vec<ScanPoint>| thinned_cost(model, scan, &Pose::identity());
+            let mean = |cost: fn(&PartModel, &[ScanPoint], &Pose) -> f64| {
+                scans.iter().map(|scan| cost(model, scan, &Pose::identity())).sum::<f64>() / count
+            };
             self.baselines.insert(
                 *label,
                 Baseline {
-                    cost: scans.iter().map(cost).sum::<f64>() / count,
+                    cost: mean(thinned_cost),
+                    motion_cost: mean(motion_cost),
                     points: scans.iter().map(|scan| scan.len() as f64).sum::<f64>() / count,
                 },
             );
