@@ -81,7 +81,7 @@ impl Recording {
         let mut tracked: BTreeMap<Stamp, (BTreeMap<Label, Pose>, BTreeMap<Label, Vector6<f64>>)> = BTreeMap::new();
         for output in outputs {
             match *output {
-                Output::Learned { span_s: (_, end_s) } => {
+                Output::Learned { span_s: (_, end_s), .. } => {
                     self.say_posterior(pipeline, counters, &frame, zero.plus_seconds(end_s))?;
                 }
                 Output::Tracked { time_s, label, displacement, twist } => {

@@ -3,7 +3,8 @@
 use std::collections::BTreeSet;
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::sync::LazyLock;
+use std::time::Instant;
 
 use anyhow::{Context, bail};
 use bayesian_object_models::{
@@ -114,6 +115,12 @@ fn now() -> Instant {
     Instant::now()
 }
 
+/// Seconds since it was first asked.
+fn clock() -> f64 {
+    static BEGIN: LazyLock<Instant> = LazyLock::new(now);
+    BEGIN.elapsed().as_secs_f64()
+}
+
 /// The files that a replay writes.
 struct Outputs {
     posterior: Option<OutputFile>,
@@ -194,7 +201,7 @@ struct Replay {
     /// Earliest and latest stamp.
     span: Option<(Stamp, Stamp)>,
     /// Of each window's learning, in order.
-    inference_wall: Vec<Duration>,
+    inference_wall_s: Vec<f64>,
     /// For the report.
     gatherer: Option<Gatherer>,
     /// Lines for the table.
@@ -207,7 +214,7 @@ impl Replay {
         settings.predict = arguments.predictions.is_some() || arguments.report.is_some() || arguments.record.is_some();
         // A report and a recording take everything as it comes.
         let at_once = arguments.report.is_some() || arguments.record.is_some();
-        settings.predict_beside_learning = !at_once && rayon::current_num_threads() > 1;
+        settings.may_lag = !at_once && rayon::current_num_threads() > 1;
         let mut root_is_given = arguments.root_label.is_some();
         let mut learned_bags = Vec::new();
         let pipeline = match &arguments.load_model {
@@ -224,14 +231,14 @@ impl Replay {
         Ok(Self {
             ingest: Ingest::new(&config.input),
             config: config.clone(),
-            pipeline,
+            pipeline: pipeline.timed_by(clock),
             root_is_given,
             model_name: arguments.load_model.as_ref().map(|path| path.display().to_string()).unwrap_or_default(),
             learned_bags,
             hash: BagHash::default(),
             seen: BTreeSet::new(),
             span: None,
-            inference_wall: Vec::new(),
+            inference_wall_s: Vec::new(),
             gatherer: arguments.report.is_some().then(Gatherer::default),
             remarks: Vec::new(),
         })
@@ -252,12 +259,13 @@ impl Replay {
                 self.push(input, outputs)?;
             }
             progress.at(bag.bytes_read());
-            progress.say(format!("{} windows", self.inference_wall.len()));
+            progress.say(format!("{} windows", self.inference_wall_s.len()));
         }
         for input in self.ingest.flush() {
             self.push(input, outputs)?;
         }
-        self.timed(Pipeline::finish, outputs)
+        let said = self.pipeline.finish();
+        self.heard(&said, outputs)
     }
 
     fn push(&mut self, input: Input, files: &mut Outputs) -> anyhow::Result<()> {
@@ -267,18 +275,14 @@ impl Replay {
         if let (Some(gatherer), Input::Wrench(wrench)) = (&mut self.gatherer, &input) {
             gatherer.wrench(wrench);
         }
-        self.timed(|pipeline| pipeline.push(input), files)
+        let outputs = self.pipeline.push(input);
+        self.heard(&outputs, files)
     }
 
-    /// A step of the pipeline; where it learned windows, what it took is theirs.
-    fn timed(&mut self, step: impl FnOnce(&mut Pipeline) -> Vec<Output>, files: &mut Outputs) -> anyhow::Result<()> {
-        let begin = now();
-        let outputs = step(&mut self.pipeline);
-        let took = begin.elapsed();
-        let learned = outputs.iter().filter(|output| matches!(output, Output::Learned { .. })).count();
-        self.inference_wall.extend((0..learned).map(|_| took / learned as u32));
+    /// What a step of the pipeline said.
+    fn heard(&mut self, outputs: &[Output], files: &mut Outputs) -> anyhow::Result<()> {
         if let Some(recording) = &mut files.recording {
-            recording.say(&outputs, &self.pipeline, self.ingest.counters())?;
+            recording.say(outputs, &self.pipeline, self.ingest.counters())?;
         }
         outputs.iter().try_for_each(|output| self.take(output, files))
     }
@@ -311,7 +315,10 @@ impl Replay {
             }
             // A replay learns in the stream.
             Output::FirstLook(_) | Output::WindowClosed(_) | Output::Tracked { .. } => {}
-            Output::Learned { span_s } => tracing::info!(from_s = span_s.0, to_s = span_s.1, "window learned"),
+            Output::Learned { span_s, wall_s } => {
+                self.inference_wall_s.push(*wall_s);
+                tracing::info!(from_s = span_s.0, to_s = span_s.1, "window learned");
+            }
             Output::Resumed { root, unexplained, unknown } => self.taken_up(*root, unexplained, unknown)?,
         }
         Ok(())
@@ -347,9 +354,9 @@ impl Replay {
             bail!("{bag_name}: --root-label {root}: no such part, seen were {}", seen.join(", "));
         }
         // Those of a loaded model come first; what they took is not known any more.
-        let loaded = posterior.windows.len().saturating_sub(self.inference_wall.len());
-        for (window, wall) in posterior.windows.iter_mut().skip(loaded).zip(&self.inference_wall) {
-            window.inference_wall_s = wall.as_secs_f64();
+        let loaded = posterior.windows.len().saturating_sub(self.inference_wall_s.len());
+        for (window, wall_s) in posterior.windows.iter_mut().skip(loaded).zip(&self.inference_wall_s) {
+            window.inference_wall_s = *wall_s;
         }
         Ok(PosteriorDocument::new(posterior, counters))
     }

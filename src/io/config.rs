@@ -104,7 +104,7 @@ impl Config {
             sampling: self.sampling(),
             declared: self.model.clone(),
             predict: false,
-            predict_beside_learning: false,
+            may_lag: false,
             posterior_latency_s: self.posterior_latency_s,
             live: false,
         }

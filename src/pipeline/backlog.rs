@@ -1,20 +1,22 @@
-//! Predictions beside learning: what the stream brought is kept until a window is learned, and is predicted
-//! from on another core meanwhile.
+//! What lags behind the stream: a window's physics are learned, and predictions made, on another core while the
+//! motion of the next window is looked at.
 //!
-//! What is predicted does not depend on when: everything is taken in its order, with the learner of its time.
+//! What is learned and predicted does not depend on when: everything is taken in its order, each frame with the
+//! learner of its time.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
 
 use super::forecast::{Forecaster, mechanism_of};
 use super::rest::RestReading;
-use super::{Frame, Learner, Output};
+use super::{Clock, Frame, Learner, Output, WindowJob};
+use crate::model::Contact;
 use crate::types::{AppliedWrench, Stamp};
 
 /// Frames that wait at most: a stream without windows is not kept.
 const MOST_FRAMES: usize = 64;
 
-/// What the forecaster is told.
+/// What waits.
 pub(super) enum News {
     /// A reading.
     Wrench(AppliedWrench),
@@ -31,41 +33,103 @@ pub(super) enum News {
     },
     /// A window was learned in the stream.
     Learned(Arc<Learner>),
+    /// A window's motion was; its physics are to be.
+    Lesson(Box<Lesson>),
 }
 
-/// A forecaster and what it was not told yet.
+/// A window whose physics are not learned yet.
+pub(super) struct Lesson {
+    /// Knows the window's motion, and keeps every window that its physics are learned with.
+    pub learner: Learner,
+    /// The window.
+    pub job: WindowJob,
+    /// What was touched in it.
+    pub contacts: Vec<Contact>,
+    /// What its motion took \[s\].
+    pub wall_s: f64,
+    /// By which to time the rest.
+    pub clock: Clock,
+}
+
+impl Lesson {
+    /// Learns the physics on from those of the windows before.
+    fn finish(self, before: Option<&Learner>) -> (Arc<Learner>, Output) {
+        let Self { mut learner, job, contacts, wall_s, clock } = self;
+        let begin = clock();
+        if let Some(before) = before {
+            learner.take_physics_of(before);
+        }
+        learner.learn_physics(&job, &contacts);
+        learner.retire();
+        let wall_s = wall_s + clock() - begin;
+        (Arc::new(learner), Output::Learned { span_s: job.span_s(), wall_s })
+    }
+}
+
+/// What the stream brought and nobody was told yet.
 pub(super) struct Backlog {
-    /// Knows all but what waits.
-    pub forecaster: Forecaster,
+    /// Knows all but what waits; `None`: nothing is predicted.
+    pub forecaster: Option<Forecaster>,
+    /// What was learned with the physics of the last window that has them, if they lag.
+    learned: Option<Arc<Learner>>,
     waiting: VecDeque<News>,
     frames: usize,
-    may_wait: bool,
+    may_lag: bool,
 }
 
 impl Backlog {
-    /// Nothing waits; nothing ever does unless it `may_wait`.
-    pub fn new(forecaster: Forecaster, may_wait: bool) -> Self {
-        Self { forecaster, waiting: VecDeque::new(), frames: 0, may_wait }
+    /// Nothing waits; nothing ever does unless it `may_lag`.
+    pub fn new(forecaster: Option<Forecaster>, may_lag: bool) -> Self {
+        Self { forecaster, learned: None, waiting: VecDeque::new(), frames: 0, may_lag }
     }
 
-    /// Takes in what came; returns predictions, unless they wait.
+    /// Whether physics may be learned later.
+    pub fn may_lag(&self) -> bool {
+        self.may_lag
+    }
+
+    /// What was learned, where physics lag.
+    pub fn learned(&self) -> Option<&Arc<Learner>> {
+        self.learned.as_ref()
+    }
+
+    /// Takes in what came; returns what is said of it, unless it waits.
     pub fn push(&mut self, news: News) -> Vec<Output> {
+        if self.forecaster.is_none() && !matches!(news, News::Lesson(_)) {
+            return Vec::new();
+        }
         self.frames += usize::from(matches!(news, News::Frame { .. }));
         self.waiting.push_back(news);
-        if self.may_wait && self.frames <= MOST_FRAMES { Vec::new() } else { self.catch_up() }
+        if self.may_lag && self.frames <= MOST_FRAMES { Vec::new() } else { self.catch_up() }
     }
 
-    /// Predictions from all that waits.
+    /// Learns and predicts from all that waits.
     pub fn catch_up(&mut self) -> Vec<Output> {
         self.frames = 0;
         let mut outputs = Vec::new();
-        for news in self.waiting.drain(..) {
-            match news {
-                News::Wrench(wrench) => outputs.extend(self.forecaster.push_wrench(&wrench)),
-                News::Frame { frame, learner, zero, rest } => {
-                    outputs.extend(self.forecaster.push_frame(frame, learner.as_deref(), zero, rest));
+        for news in std::mem::take(&mut self.waiting) {
+            let learned = match news {
+                News::Wrench(wrench) => {
+                    let forecaster = self.forecaster.iter_mut();
+                    outputs.extend(forecaster.flat_map(|forecaster| forecaster.push_wrench(&wrench)));
+                    continue;
                 }
-                News::Learned(learner) => self.forecaster.learned(&learner, mechanism_of(&learner), None),
+                News::Frame { frame, learner, zero, rest } => {
+                    if let Some(forecaster) = &mut self.forecaster {
+                        outputs.extend(forecaster.push_frame(frame, learner.as_deref(), zero, rest));
+                    }
+                    continue;
+                }
+                News::Learned(learner) => learner,
+                News::Lesson(lesson) => {
+                    let (learner, said) = lesson.finish(self.learned.as_deref());
+                    self.learned = Some(Arc::clone(&learner));
+                    outputs.push(said);
+                    learner
+                }
+            };
+            if let Some(forecaster) = &mut self.forecaster {
+                forecaster.learned(&learned, mechanism_of(&learned), None);
             }
         }
         outputs
@@ -74,7 +138,7 @@ impl Backlog {
     /// The same at the end of the stream, with the rest.
     pub fn finish(&mut self) -> Vec<Output> {
         let mut outputs = self.catch_up();
-        outputs.extend(self.forecaster.finish());
+        outputs.extend(self.forecaster.iter_mut().flat_map(Forecaster::finish));
         outputs
     }
 }

@@ -20,8 +20,8 @@ use crate::model::{
 };
 use crate::registration::{
     AlignmentSettings, AxisSeed, JointFrame, JointPath, OUTLIER_COST, PartModel, Quadratic, ScanPoint, fit_circle,
-    fit_line, follow, geometric_seeds, outline_quadratic, pose_factor, rays_near, search_path, seen_through,
-    thinned_cost,
+    fit_line, follow, geometric_seeds, motion_cost, outline_quadratic, pose_factor, rays_near, search_path,
+    seen_through,
 };
 use crate::types::Label;
 
@@ -76,6 +76,8 @@ pub struct Frame {
 pub struct Baseline {
     /// Mean truncated cost per point.
     pub cost: f64,
+    /// The same as motions are judged, where other sides may come into view.
+    pub motion_cost: f64,
     /// Mean number of points in a scan.
     pub points: f64,
 }
@@ -315,12 +317,12 @@ impl<'a> Scene<'a> {
             .filter(|(k, _)| !self.scan(label, *k).is_empty())
             .map(|(k, d)| {
                 let scan = self.scan(label, k);
-                let cost = thinned_cost(model, scan, d);
+                let cost = motion_cost(model, scan, d);
                 // Per point, what is turned away from the sensor does not count; per scan, new faces
                 // do not. Either may happen, so the smaller excess is taken.
-                let per_point = cost - baseline.cost;
+                let per_point = cost - baseline.motion_cost;
                 let matched = (OUTLIER_COST - cost) * scan.len() as f64 / baseline.points.max(1.0);
-                let excess = per_point.min(OUTLIER_COST - baseline.cost - matched).max(-0.3);
+                let excess = per_point.min(OUTLIER_COST - baseline.motion_cost - matched).max(-0.3);
                 excess + SEEN_THROUGH_COST * self.seen_through(label, k, d)
             })
             .collect();
@@ -402,7 +404,7 @@ impl<'a> Scene<'a> {
                 [.., before, last] => *last * before.inverse() * *last,
                 _ => last,
             };
-            let cost = |pose: &Pose| thinned_cost(model, scan, pose);
+            let cost = |pose: &Pose| motion_cost(model, scan, pose);
             let start = if cost(&ahead) < cost(&last) { ahead } else { last };
             track.push(if scan.is_empty() { last } else { follow(model, scan, &start, &settings).displacement });
         }

@@ -1,5 +1,7 @@
 //! The scans that a part's model grows from: a bounded number of them, of a bounded number of points.
 
+use std::sync::Arc;
+
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
@@ -30,7 +32,8 @@ pub enum Place {
 #[derive(Clone, Debug, PartialEq)]
 struct Keyframe {
     place: Place,
-    scan: Vec<ScanPoint>,
+    /// Shared by copies.
+    scan: Arc<Vec<ScanPoint>>,
 }
 
 /// The scans of one part.
@@ -44,7 +47,7 @@ impl Keyframes {
         for (frame, scan) in scans.enumerate().step_by(every) {
             let Some(scan) = scan else { continue };
             let thin = scan.len().div_ceil(MOST_POINTS).max(1);
-            let scan = scan.iter().step_by(thin).copied().collect();
+            let scan = Arc::new(scan.iter().step_by(thin).copied().collect());
             self.0.push(Keyframe { place: Place::Frame { window, frame }, scan });
         }
         while self.0.len() > MOST {
@@ -105,7 +108,7 @@ impl Serialize for Keyframe {
     fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut viewpoints: Vec<Option<Vector3<f64>>> = Vec::new();
         let mut points = Vec::with_capacity(self.scan.len());
-        for ScanPoint { point_in_world: p, viewpoint_in_world } in &self.scan {
+        for ScanPoint { point_in_world: p, viewpoint_in_world } in self.scan.iter() {
             let known = viewpoints.iter().position(|viewpoint| viewpoint == viewpoint_in_world);
             points.push((p.x, p.y, p.z, known.unwrap_or(viewpoints.len())));
             if known.is_none() {
@@ -125,7 +128,7 @@ impl<'de> Deserialize<'de> for Keyframe {
         };
         let scan: Option<Vec<ScanPoint>> = stored.points.iter().map(point).collect();
         let scan = scan.ok_or_else(|| serde::de::Error::custom("a point of a viewpoint that is not there"))?;
-        Ok(Self { place: stored.place, scan })
+        Ok(Self { place: stored.place, scan: Arc::new(scan) })
     }
 }
 

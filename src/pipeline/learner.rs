@@ -21,7 +21,8 @@ use crate::model::{
 };
 use crate::model::{DynamicsInput, DynamicsLearner, DynamicsPosterior, WindowInference};
 use crate::registration::{
-    AlignmentSettings, PartModel, ScanPoint, Surfel, SurfelAccumulator, fit_circle, fit_line, rays_near, thinned_cost,
+    AlignmentSettings, PartModel, ScanPoint, Surfel, SurfelAccumulator, fit_circle, fit_line, motion_cost, rays_near,
+    thinned_cost,
 };
 use crate::structure::TreeDistribution;
 use crate::types::posterior::WindowRecord;
@@ -340,11 +341,14 @@ impl Learner {
                 continue;
             }
             let count = scans.len() as f64;
-            let cost = |scan: &&Vec<ScanPoint>| thinned_cost(model, scan, &Pose::identity());
+            let mean = |cost: fn(&PartModel, &[ScanPoint], &Pose) -> f64| {
+                scans.iter().map(|scan| cost(model, scan, &Pose::identity())).sum::<f64>() / count
+            };
             self.baselines.insert(
                 *label,
                 Baseline {
-                    cost: scans.iter().map(cost).sum::<f64>() / count,
+                    cost: mean(thinned_cost),
+                    motion_cost: mean(motion_cost),
                     points: scans.iter().map(|scan| scan.len() as f64).sum::<f64>() / count,
                 },
             );
@@ -370,6 +374,14 @@ impl Learner {
 
     /// Learns one window.
     pub fn learn(&mut self, job: &WindowJob) {
+        let contacts = self.learn_motion(job);
+        self.learn_physics(job, &contacts);
+        self.retire();
+    }
+
+    /// What a window says of the parts, their motions and the joints between them; returns the contacts. None of
+    /// it depends on the physics.
+    pub(super) fn learn_motion(&mut self, job: &WindowJob) -> Vec<Contact> {
         self.meet_posed(job);
         let (measured, poses) = self.posed_motions(job);
         let scene = self.scene(job);
@@ -432,9 +444,27 @@ impl Learner {
             }
         }
         self.choose_root();
-        self.learn_dynamics(job, &contacts);
+        for (label, model) in &self.models {
+            let points: Vec<Vector3<f64>> = model.surfels.iter().map(|s| s.point).collect();
+            if let Some(hull) = hull_properties(&points, None) {
+                self.hulls.insert(*label, hull);
+            }
+        }
+        contacts
+    }
+
+    /// What the same window says of dynamics, and what those lack.
+    pub(super) fn learn_physics(&mut self, job: &WindowJob, contacts: &[Contact]) {
+        self.learn_dynamics(job, contacts);
         self.record(job);
-        self.retire();
+    }
+
+    /// Takes over the physics of one that has learned them of all windows but the newest.
+    pub(super) fn take_physics_of(&mut self, other: &Self) {
+        self.dynamics.clone_from(&other.dynamics);
+        self.critic.clone_from(&other.critic);
+        self.inferences.clone_from(&other.inferences);
+        self.records.clone_from(&other.records);
     }
 
     /// Whether a part keeps its place on the one that carries it.
@@ -448,12 +478,6 @@ impl Learner {
     }
 
     fn learn_dynamics(&mut self, job: &WindowJob, contacts: &[Contact]) {
-        for (label, model) in &self.models {
-            let points: Vec<Vector3<f64>> = model.surfels.iter().map(|s| s.point).collect();
-            if let Some(hull) = hull_properties(&points, None) {
-                self.hulls.insert(*label, hull);
-            }
-        }
         let Some(fit) = &self.fit else {
             self.inferences.push(WindowInference::default());
             self.dynamics.keep_window(contacts);

@@ -40,7 +40,7 @@ use crate::math::Pose;
 use crate::model::{DeclaredPhysics, KinematicSettings, PoseMeasurement};
 use crate::registration::{AlignmentSettings, Quadratic, follow, thinned_cost};
 use crate::types::{Input, Label, Stamp};
-use backlog::{Backlog, News};
+use backlog::{Backlog, Lesson, News};
 use evaluate::Scoring;
 use explain::{FEWEST_POINTS, measurement_of, travel};
 use first_look::REFERENCE_FRAMES;
@@ -80,8 +80,9 @@ pub struct PipelineSettings {
     pub declared: DeclaredPhysics,
     /// Whether to predict.
     pub predict: bool,
-    /// Predictions may be said late, in their order: they are made while windows are learned.
-    pub predict_beside_learning: bool,
+    /// Predictions, and what windows teach of physics, may be said late, in their order: they are made while the
+    /// motion of the next window is looked at.
+    pub may_lag: bool,
     /// For prediction, a posterior counts from its window's close plus this \[s\].
     pub posterior_latency_s: f64,
     /// The stream does not wait: closed windows are handed out for a [`Worker`] to learn, and
@@ -143,8 +144,13 @@ pub enum Output {
     Learned {
         /// Seconds since time zero of its first and last frame.
         span_s: (f64, f64),
+        /// What it took by the pipeline's clock \[s\].
+        wall_s: f64,
     },
 }
+
+/// Seconds since an arbitrary zero.
+pub type Clock = fn() -> f64;
 
 /// From inputs to outputs; the same for a recorded and a live stream.
 pub struct Pipeline {
@@ -170,6 +176,7 @@ pub struct Pipeline {
     handed_out: VecDeque<(u64, BTreeMap<Label, Pose>)>,
     closed_windows: u64,
     backlog: Option<Backlog>,
+    clock: Clock,
     /// The latest stamp of a frame.
     newest: Option<Stamp>,
     /// Windows are scored, not learned.
@@ -185,10 +192,12 @@ pub struct Pipeline {
 impl Pipeline {
     /// A pipeline that has seen nothing.
     pub fn new(settings: PipelineSettings) -> Self {
-        let may_wait = settings.predict_beside_learning && !settings.live;
-        let backlog = settings.predict.then(|| Backlog::new(Forecaster::new(&settings), may_wait));
+        let may_lag = settings.may_lag && !settings.live;
+        let forecaster = settings.predict.then(|| Forecaster::new(&settings));
+        let backlog = (settings.predict || may_lag).then(|| Backlog::new(forecaster, may_lag));
         Self {
             backlog,
+            clock: || 0.0,
             poses: PoseBuffer::new(settings.poses),
             last_frame_s: None,
             settings,
@@ -225,9 +234,20 @@ impl Pipeline {
         self.zero.map(|zero| (zero.plus_seconds(self.begin_s), self.begin_s))
     }
 
+    /// The same with a clock by which learning is timed; nothing else depends on it.
+    #[must_use]
+    pub fn timed_by(self, clock: Clock) -> Self {
+        Self { clock, ..self }
+    }
+
     /// What has been learned; `None` before the first window.
     pub fn learner(&self) -> Option<&Learner> {
-        self.learner.as_deref()
+        self.known().map(Arc::as_ref)
+    }
+
+    /// The same, without windows whose physics are still to be learned.
+    fn known(&self) -> Option<&Arc<Learner>> {
+        self.backlog.as_ref().and_then(Backlog::learned).or(self.learner.as_ref())
     }
 
     /// One input, in the working frame.
@@ -328,12 +348,8 @@ impl Pipeline {
         if self.learner.is_none() && self.first_look.is_none() && (self.is_open() || window.is_some()) {
             outputs.extend(self.open_reference());
         }
-        let closed = window.is_some() && !self.settings.live;
         outputs.extend(window.into_iter().flat_map(|window| self.close(window)));
         if let (Some(backlog), Some(frame)) = (&mut self.backlog, seen) {
-            if let Some(learner) = self.learner.as_ref().filter(|_| closed) {
-                outputs.extend(backlog.push(News::Learned(Arc::clone(learner))));
-            }
             let rest = self.cutter.as_ref().and_then(WindowCutter::rest_reading).unwrap_or_default();
             let preview = self.preview.as_ref().filter(|_| self.first_look.is_some());
             let learner = self.learner.as_ref().or(preview).cloned();
@@ -346,11 +362,7 @@ impl Pipeline {
     fn end_record(&mut self) -> Vec<Output> {
         self.poses.end_record();
         let Some(window) = self.cutter.as_mut().and_then(WindowCutter::end_record) else { return Vec::new() };
-        let mut outputs = self.close(window);
-        if let (Some(backlog), Some(learner), false) = (&mut self.backlog, &self.learner, self.settings.live) {
-            outputs.extend(backlog.push(News::Learned(Arc::clone(learner))));
-        }
-        outputs
+        self.close(window)
     }
 
     /// The frames of the first look, until something was learned of them.
@@ -420,11 +432,28 @@ impl Pipeline {
             return Vec::new();
         }
         let learning = Arc::make_mut(learner);
-        let backlog = &mut self.backlog;
-        let predict = || backlog.as_mut().map_or_else(Vec::new, Backlog::catch_up);
-        let ((), mut outputs) = rayon::join(|| learning.learn(&job), predict);
-        self.current.extend(learner.displacements.iter().map(|(l, d)| (*l, *d)));
-        outputs.push(Output::Learned { span_s: job.span_s() });
+        let (clock, backlog) = (self.clock, &mut self.backlog);
+        let learn = || {
+            let begin = clock();
+            let contacts = learning.learn_motion(&job);
+            (contacts, clock() - begin)
+        };
+        let catch_up = || backlog.as_mut().map_or_else(Vec::new, Backlog::catch_up);
+        let ((contacts, wall_s), mut outputs) = rayon::join(learn, catch_up);
+        self.current.extend(learning.displacements.iter().map(|(l, d)| (*l, *d)));
+        if let Some(backlog) = backlog.as_mut().filter(|backlog| backlog.may_lag()) {
+            let lesson = Lesson { learner: learning.clone(), job, contacts, wall_s, clock };
+            learning.retire();
+            outputs.extend(backlog.push(News::Lesson(Box::new(lesson))));
+            return outputs;
+        }
+        let begin = clock();
+        learning.learn_physics(&job, &contacts);
+        learning.retire();
+        outputs.push(Output::Learned { span_s: job.span_s(), wall_s: wall_s + clock() - begin });
+        if let Some(backlog) = backlog {
+            outputs.extend(backlog.push(News::Learned(Arc::clone(learner))));
+        }
         outputs
     }
 
@@ -445,10 +474,10 @@ impl Pipeline {
         }
         self.learner = Some(Arc::clone(&learned.learner));
         (self.first_look, self.preview) = (None, None);
-        if let Some(backlog) = &mut self.backlog {
-            backlog.forecaster.learned(&learned.learner, learned.mechanism.clone(), Some(&self.current));
+        if let Some(forecaster) = self.backlog.as_mut().and_then(|backlog| backlog.forecaster.as_mut()) {
+            forecaster.learned(&learned.learner, learned.mechanism.clone(), Some(&self.current));
         }
-        Output::Learned { span_s: learned.span_s }
+        Output::Learned { span_s: learned.span_s, wall_s: 0.0 }
     }
 
     /// Registers every part of a frame, from where it was.

@@ -22,7 +22,7 @@ pub struct Planner {
 impl Pipeline {
     /// What plans are answered from; `None` until a joint is learned, or without predictions.
     pub fn planner(&self) -> Option<Planner> {
-        let (filter, places, frame) = self.backlog.as_ref()?.forecaster.knowledge()?;
+        let (filter, places, frame) = self.backlog.as_ref()?.forecaster.as_ref()?.knowledge()?;
         Some(Planner { filter, places, frame, world_from_work: self.world_from_work() })
     }
 }

@@ -29,7 +29,7 @@ const CENTER_SHARE: f64 = 0.3;
 impl Pipeline {
     /// What is believed now, in the working frame.
     pub(super) fn posterior_in_work(&self) -> Option<ObjectPosterior> {
-        if let Some(learner) = &self.learner {
+        if let Some(learner) = self.known() {
             return Some(learner.posterior());
         }
         let mut parts = Parts { surfaces: self.surfaces_in_work(), origins: BTreeMap::new() };
@@ -42,7 +42,7 @@ impl Pipeline {
 
     /// Points of each part's surface at the reference configuration, in the working frame \[m\].
     pub(super) fn surfaces_in_work(&self) -> BTreeMap<Label, Vec<Vector3<f64>>> {
-        if let Some(learner) = &self.learner {
+        if let Some(learner) = self.known() {
             return learner.surfaces();
         }
         let last = self.frames_at_rest().last().into_iter().flat_map(|frame| frame.scans.iter());

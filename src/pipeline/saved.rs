@@ -17,7 +17,7 @@ use super::{Learner, Output, Pipeline, PipelineSettings};
 use crate::math::Pose;
 use crate::model::KinematicJoint;
 use crate::registration::{
-    JointFrame, OUTLIER_COST, PartModel, ScanPoint, Surfel, SurfelAccumulator, search_path, thinned_cost,
+    FromBehind, JointFrame, OUTLIER_COST, PartModel, ScanPoint, Surfel, SurfelAccumulator, search_path, thinned_cost,
     truncated_cost,
 };
 use crate::types::{Label, Stamp};
@@ -128,7 +128,7 @@ impl Pipeline {
             gravity_in_world: self.settings.gravity_in_world,
             zero: self.zero?,
             newest: self.newest?,
-            learner: Arc::clone(self.learner.as_ref()?),
+            learner: Arc::clone(self.known()?),
         })
     }
 
@@ -177,8 +177,8 @@ impl Pipeline {
         let unknown: Vec<Label> = unknown.copied().collect();
         self.current = learner.displacements.clone();
         self.newcomers = (!unknown.is_empty()).then(Vec::new);
-        if let Some(backlog) = &mut self.backlog {
-            backlog.forecaster.resumed(&learner, frame.time_s, positions);
+        if let Some(forecaster) = self.backlog.as_mut().and_then(|backlog| backlog.forecaster.as_mut()) {
+            forecaster.resumed(&learner, frame.time_s, positions);
         }
         let root = learner.root;
         self.learner = Some(Arc::new(learner));
@@ -259,7 +259,9 @@ fn located(model: &PartModel, scan: &[ScanPoint], joint: &KinematicJoint, parent
     let screw = joint.screw();
     let grid = grid_of(model, &screw, joint.joint_type);
     let frame = JointFrame { scan, parent: *parent, tool: None };
-    let cost = |q: f64| truncated_cost(model, scan, scan.len() / REFINING_POINTS, &(*parent * screw.displacement(q)));
+    let stride = scan.len() / REFINING_POINTS;
+    let place = |q: f64| *parent * screw.displacement(q);
+    let cost = |q: f64| truncated_cost(model, scan, stride, &place(q), FromBehind::OtherSide);
     let refined = |start: f64| {
         let (mut best, mut step) = ((cost(start), start), 0.5 * grid.2);
         for _ in 0..5 {

@@ -3,7 +3,7 @@
 
 use nalgebra::Vector3;
 
-use super::{PartModel, ScanPoint, truncated_cost};
+use super::{FromBehind, PartModel, ScanPoint, truncated_cost};
 use crate::math::{Pose, Screw};
 
 /// Points of a scan that the grid looks at.
@@ -57,7 +57,7 @@ pub fn search_path(
         let stride = (frame.scan.len() / GRID_POINTS).max(1);
         let cost_of = |place: &Pose| {
             let displacement = frame.parent * *place;
-            let mut cost = truncated_cost(model, frame.scan, stride, &displacement);
+            let mut cost = truncated_cost(model, frame.scan, stride, &displacement, FromBehind::OtherSide);
             if let (Some(tool), Some(point)) = (frame.tool, contact_point) {
                 let miss = (displacement.transform_point(point) - tool).norm().min(TOOL_CAP);
                 cost += 0.5 * (miss / 0.010).powi(2);

@@ -14,6 +14,9 @@ pub const OUTLIER_COST: f64 = 4.5;
 /// Surfels are this far apart \[m\]: a point further off along the surface lies beyond a boundary.
 const BOUNDARY_SLACK: f64 = 0.012;
 
+/// A part's other side is at most this far behind a face \[m\].
+const THICKNESS: f64 = 0.040;
+
 /// How scans are matched.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AlignmentSettings {
@@ -152,28 +155,60 @@ pub fn pose_factor(
 /// Points of a scan that [`thinned_cost`] looks at, about.
 const COST_POINTS: usize = 150;
 
+/// What a point is that is seen from behind the face nearest to it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FromBehind {
+    /// It matches nothing: a pose that is free to move might pass all points for such.
+    Outlier,
+    /// It lies on the part's other side, which was not seen before: for motions of one degree of freedom.
+    OtherSide,
+}
+
 /// [`truncated_cost`] by a few points of a scan: poses are compared with it all the time.
 pub fn thinned_cost(model: &PartModel, scan: &[ScanPoint], displacement: &Pose) -> f64 {
-    truncated_cost(model, scan, scan.len() / COST_POINTS, displacement)
+    truncated_cost(model, scan, scan.len() / COST_POINTS, displacement, FromBehind::Outlier)
+}
+
+/// [`thinned_cost`] on a motion whose other poses show the same: the part's other side may come into view.
+pub fn motion_cost(model: &PartModel, scan: &[ScanPoint], displacement: &Pose) -> f64 {
+    truncated_cost(model, scan, scan.len() / COST_POINTS, displacement, FromBehind::OtherSide)
 }
 
 /// Mean truncated cost per point, between 0 and `OUTLIER_COST`: for comparing far-apart poses.
-pub fn truncated_cost(model: &PartModel, scan: &[ScanPoint], stride: usize, displacement: &Pose) -> f64 {
+pub fn truncated_cost(
+    model: &PartModel,
+    scan: &[ScanPoint],
+    stride: usize,
+    displacement: &Pose,
+    from_behind: FromBehind,
+) -> f64 {
     let reference_from_world = displacement.inverse();
     let mut cost = 0.0;
     let mut count = 0.0;
     for scan_point in scan.iter().step_by(stride.max(1)) {
         count += 1.0;
         let y = reference_from_world.transform_point(&scan_point.point_in_world);
-        cost += matching_surfel(model, scan_point, &y, &reference_from_world).map_or(OUTLIER_COST, |index| {
-            let surfel = &model.surfels[index];
-            let offset = y - surfel.point;
-            let e = surfel.normal.dot(&offset);
-            let along = ((offset - surfel.normal * e).norm() - BOUNDARY_SLACK).max(0.0);
-            (0.5 * (e / surfel.sigma).powi(2) + 0.5 * (along / 0.010).powi(2)).min(OUTLIER_COST)
-        });
+        let facing = matching_surfel(model, scan_point, &y, &reference_from_world);
+        let behind = || model.field.nearest(&y)[0].filter(|_| from_behind == FromBehind::OtherSide);
+        let Some(index) = facing.or_else(|| behind().map(|index| index as usize)) else {
+            cost += OUTLIER_COST;
+            continue;
+        };
+        let surfel = &model.surfels[index];
+        let offset = y - surfel.point;
+        let e = surfel.normal.dot(&offset);
+        let along = ((offset - surfel.normal * e).norm() - BOUNDARY_SLACK).max(0.0);
+        let height = if facing.is_some() { 0.5 * (e / surfel.sigma).powi(2) } else { back_cost(e, surfel.sigma) };
+        cost += (height + 0.5 * (along / 0.010).powi(2)).min(OUTLIER_COST);
     }
     if count > 0.0 { cost / count } else { 0.0 }
+}
+
+/// Cost of a point seen from behind a face at a height over it \[m\]: on the part's other side, which was
+/// not seen yet, anywhere within its thickness; nothing is seen through a face.
+fn back_cost(height: f64, sigma: f64) -> f64 {
+    let anywhere = (THICKNESS / (sigma * std::f64::consts::TAU.sqrt())).ln().max(0.0);
+    anywhere + 0.5 * (height.max(-THICKNESS - height).max(0.0) / sigma).powi(2)
 }
 
 /// The nearest surfel that faces the sensor, if any is in reach.
@@ -210,4 +245,53 @@ fn add_residual(
     face.hessian += jacobian * (jacobian * weight).transpose();
     face.gradient += jacobian * (weight * e);
     0.5 * (freedom + 1.0) * (normalized * normalized / freedom).ln_1p()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::math::Screw;
+    use crate::registration::SurfelAccumulator;
+
+    /// A lid of 30 cm × 30 cm × 12 mm hinged at x = 0, as a sensor in front of it and above sees it at an angle.
+    fn scan_of_lid(screw: &Screw, angle: f64) -> Vec<ScanPoint> {
+        let eye = Vector3::new(1.2, 0.0, 0.4);
+        let lid = screw.displacement(angle);
+        let eye_at_lid = lid.inverse().transform_point(&eye);
+        let height = if eye_at_lid.z > 0.0 { 0.006 } else { -0.006 };
+        let cell = |i: i32| (f64::from(i % 31) * 0.01, f64::from(i / 31) * 0.01 - 0.15);
+        (0..31 * 31)
+            .map(|i| ScanPoint {
+                point_in_world: lid.transform_point(&Vector3::new(cell(i).0, cell(i).1, height)),
+                viewpoint_in_world: Some(eye),
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_lid_that_shows_its_underside_is_found_open() {
+        let hinge = Screw::revolute(&-Vector3::y(), &Vector3::zeros());
+        let mut accumulator = SurfelAccumulator::default();
+        for _ in 0..3 {
+            accumulator.add(&scan_of_lid(&hinge, 0.0), &Pose::identity());
+        }
+        let model = PartModel::new(&accumulator.surfels()).expect("enough surfels");
+        let scan = scan_of_lid(&hinge, 1.0);
+        assert!(thinned_cost(&model, &scan, &hinge.displacement(1.0)) > 0.9 * OUTLIER_COST, "nothing known is seen");
+        let open = motion_cost(&model, &scan, &hinge.displacement(1.0));
+        assert!(open < 0.8 * OUTLIER_COST, "{open}");
+        let slide = Screw::prismatic(&Vector3::z());
+        for elsewhere in [Pose::identity(), hinge.displacement(0.5), hinge.displacement(1.4), slide.displacement(0.12)]
+        {
+            let cost = motion_cost(&model, &scan, &elsewhere);
+            assert!(cost > open + 0.3, "{cost} against {open}");
+        }
+    }
+
+    #[test]
+    fn nothing_is_seen_through_a_face() {
+        assert!(back_cost(0.010, 0.002) > OUTLIER_COST);
+        assert!(back_cost(-THICKNESS - 0.010, 0.002) > OUTLIER_COST);
+        assert!(back_cost(-0.012, 0.002) < OUTLIER_COST);
+    }
 }

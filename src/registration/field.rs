@@ -1,5 +1,7 @@
 //! Nearest surfel by look-up: a dense grid around the surface, two sides per cell.
 
+use std::sync::Arc;
+
 use nalgebra::Vector3;
 
 use super::Surfel;
@@ -18,7 +20,8 @@ pub struct NearestField {
     origin: Vector3<f64>,
     cell: f64,
     shape: [usize; 3],
-    cells: Vec<[u32; 2]>,
+    /// Shared by copies: they are by far the largest part of a model.
+    cells: Arc<[[u32; 2]]>,
 }
 
 impl NearestField {
@@ -36,14 +39,14 @@ impl NearestField {
         let extent = high - low + Vector3::repeat(2.0 * REACH);
         let cell = CELL.max((extent.product() / MOST_CELLS).cbrt());
         let shape = [0, 1, 2].map(|axis| (extent[axis] / cell).ceil() as usize + 1);
-        let mut field =
-            Self { origin: low - Vector3::repeat(REACH), cell, shape, cells: vec![[NONE; 2]; shape.iter().product()] };
-        field.fill(surfels);
+        let mut field = Self { origin: low - Vector3::repeat(REACH), cell, shape, cells: Arc::default() };
+        field.cells = field.filled(surfels).into();
         field
     }
 
-    fn fill(&mut self, surfels: &[Surfel]) {
-        let mut distances = vec![[f32::INFINITY; 2]; self.cells.len()];
+    fn filled(&self, surfels: &[Surfel]) -> Vec<[u32; 2]> {
+        let mut cells = vec![[NONE; 2]; self.shape.iter().product()];
+        let mut distances = vec![[f32::INFINITY; 2]; cells.len()];
         let reach = REACH / self.cell;
         let reach_squared = (reach * reach) as f32;
         for (index, surfel) in surfels.iter().enumerate() {
@@ -63,12 +66,13 @@ impl NearestField {
                     }
                     let row = (x * self.shape[1] + y) * self.shape[2];
                     for (z, dz) in along(2, f64::from(left).sqrt()) {
-                        let (cell, distances) = (&mut self.cells[row + z], &mut distances[row + z]);
+                        let (cell, distances) = (&mut cells[row + z], &mut distances[row + z]);
                         insert(cell, distances, index as u32, abreast + dz * dz, surfels);
                     }
                 }
             }
         }
+        cells
     }
 
     /// The surfels nearest to `point`: the nearest, and the nearest of those that face away from it.

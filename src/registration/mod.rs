@@ -15,7 +15,10 @@ mod surfels;
 
 pub use align::{Alignment, align, follow};
 pub use articulated::{JointFrame, JointPath, search_path};
-pub use factor::{AlignmentSettings, OUTLIER_COST, PoseFactor, Quadratic, pose_factor, thinned_cost, truncated_cost};
+pub use factor::{
+    AlignmentSettings, FromBehind, OUTLIER_COST, PoseFactor, Quadratic, motion_cost, pose_factor, thinned_cost,
+    truncated_cost,
+};
 pub use field::NearestField;
 pub use outline::{Outline, outline_quadratic, rays_near, seen_through};
 pub use seeds::{AxisSeed, fit_circle, fit_line, geometric_seeds};

@@ -21,6 +21,8 @@ const NOISE_SCALES: [f64; 6] = [1.0, 3.0, 10.0, 30.0, 100.0, 300.0];
 const LOG_NOISE_DEVIATION: f64 = 1.5;
 /// Weight, in innovations, of the prior that innovations have unit variance.
 const VARIANCE_PRIOR: f64 = 10.0;
+/// Half a deviation of a kinematic number changes innovations by this much at most, root mean square.
+const RUNAWAY: f64 = 30.0;
 /// A stuck joint's load is known to this share: friction below the load is unlikelier than that.
 const LOAD_DEVIATION: f64 = 0.1;
 
@@ -224,25 +226,22 @@ impl WindowFit<'_> {
             return result;
         };
         for (column, deviation) in deviations.iter().enumerate().filter(|(_, d)| **d > 0.0) {
-            let step = 0.5 * deviation;
-            let kinematics = self.moved(column, step);
-            let Some(track) = joint_track(&self.source, &kinematics) else {
-                continue;
-            };
-            let model = WindowModel { axes: &kinematics.axes, track: &track, ..self.model(fitted.noise_scale) };
-            let Ok(residuals) = model.residuals(&x, &fitted.innovations.gains) else {
-                continue;
-            };
-            if residuals.len() != fitted.innovations.whitened.len() {
-                continue;
-            }
-            let slope = DVector::from_iterator(
-                residuals.len(),
-                residuals.iter().zip(&fitted.innovations.whitened).map(|(a, b)| (a - b) / step),
-            );
+            let slope = settled_slope(*deviation, |step| self.change(&x, fitted, column, step));
+            let Some(slope) = slope else { continue };
             result.set_column(column, &cholesky.solve(&(jacobian.transpose() * slope)));
         }
         result
+    }
+
+    /// By how much the innovations change at the same numbers and gains where one kinematic number is moved.
+    fn change(&self, x: &[f64], fitted: &FittedWindow, column: usize, step: f64) -> Option<DVector<f64>> {
+        let kinematics = self.moved(column, step);
+        let track = joint_track(&self.source, &kinematics)?;
+        let model = WindowModel { axes: &kinematics.axes, track: &track, ..self.model(fitted.noise_scale) };
+        let residuals = model.residuals(x, &fitted.innovations.gains).ok()?;
+        let before = &fitted.innovations.whitened;
+        let change = || residuals.iter().zip(before).map(|(after, before)| after - before);
+        (residuals.len() == before.len()).then(|| DVector::from_iterator(before.len(), change()))
     }
 
     /// The kinematics with one number moved: axis parameters joint by joint, then the tool's offset.
@@ -260,6 +259,16 @@ impl WindowFit<'_> {
         moved.tool_offset[at] += step;
         moved
     }
+}
+
+/// The slope of a change by the difference over half a deviation. A difference that runs away (with the gains
+/// held, on the other side of a stop) is none: then it is taken over less, and `None` where that runs away too.
+fn settled_slope(deviation: f64, change: impl Fn(f64) -> Option<DVector<f64>>) -> Option<DVector<f64>> {
+    [0.5, 0.05, 0.005].into_iter().find_map(|share| {
+        let step = share * deviation;
+        let change = change(step)?;
+        (change.norm() < RUNAWAY * (change.len() as f64).sqrt()).then(|| change / step)
+    })
 }
 
 /// An axis moved along one of its four directions; see the kinematic fit.
@@ -337,4 +346,20 @@ pub fn load_factor(log_load: f64, mean: f64, deviation: f64, size: usize) -> Gau
         gaussian.information[FRICTION] = matched / variance - mean / (deviation * deviation);
     }
     gaussian
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_difference_that_runs_away_is_no_slope() {
+        let beyond = |limit: f64| {
+            move |step: f64| Some(DVector::from_element(4, if step < limit { 3.0 * step } else { f64::INFINITY }))
+        };
+        let slope = |limit: f64| settled_slope(0.2, beyond(limit)).map(|slope| slope[0]);
+        assert!(slope(1.0).is_some_and(|slope| (slope - 3.0).abs() < 1e-12));
+        assert!(slope(0.05).is_some_and(|slope| (slope - 3.0).abs() < 1e-12));
+        assert_eq!(slope(0.0), None);
+    }
 }
