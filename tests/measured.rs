@@ -106,6 +106,7 @@ fn a_cabinets_hinge_closes_itself() {
     let criticism = study.learn("fit.mcap", &[]).posterior.criticism;
     let first = criticism.effects.first().unwrap();
     assert!(["self_closing", "position_friction"].contains(&first.name.as_str()), "{criticism:?}");
+    assert_eq!(criticism.effects.len(), 1, "{criticism:?}");
     let ladder = study.ladder("score.mcap");
     // A door that nothing could move, or that a stop held, would leave no force.
     let (_, base) = &ladder[0];
@@ -121,7 +122,11 @@ fn motors_rub_and_answer_late() {
     let study = Study::new("double_pendulum");
     study.import(&table, "double_pendulum", "fit.mcap", &[]);
     study.import(&other, "double_pendulum", "score.mcap", &[]);
-    study.learn("fit.mcap", &[]);
+    let criticism = study.learn("fit.mcap", &[]).posterior.criticism;
+    let delay = criticism.effects.iter().find(|effect| effect.name == "wrench_delay");
+    let delay = &delay.unwrap_or_else(|| panic!("{criticism:?}")).parameters["delay"];
+    assert!(delay.q95 < 0.0, "torques act after their stamps: {delay:?}");
+    assert_eq!(criticism.effects.len(), 3, "friction of both, the delay and nothing else: {criticism:?}");
     let ladder = study.ladder("score.mcap");
     let (_, base) = &ladder[0];
     let (first, parts) = &ladder[1];
