@@ -356,7 +356,9 @@ impl InverseDynamics {
         let Self { accelerations: own, spatial, momenta, totals, .. } = self;
         own.clear();
         own.extend(accelerations);
-        (spatial.clear(), momenta.clear(), totals.clear());
+        spatial.clear();
+        momenta.clear();
+        totals.clear();
         for (k, &parent) in tree.parents.iter().enumerate() {
             let (twist, acceleration) = motion_above(tree, parent, spatial, plain);
             let driven = plain.screws[k] * own[k] + twist.cross_motion(&(plain.screws[k] * plain.middle_rates[k]));
