@@ -239,8 +239,7 @@ fn leaves_much(workshop: &Workshop<'_>, selection: &Selection, scores: &Scores) 
     scores.rows.iter().any(|row| {
         let Some(joint) = workshop.fit.joints.iter().position(|joint| joint.child == row.label) else { return false };
         let Some(scales) = workshop.learner.joint_scales(joint, workshop.fit) else { return false };
-        let fits = selection.components.iter().filter(|c| c.joints.contains(&joint)).filter_map(|c| c.fitted.as_ref());
-        let noise = crate::math::median(fits.flat_map(|f| &f.windows).map(|window| window.noise_scale).collect());
+        let noise = crate::math::median(selection.noise_scales_of(Some(joint)));
         let force = row.force_rmse_n.or(row.torque_rmse_nm).unwrap_or(0.0);
         noise.is_some_and(|scale| scale >= MUCH.0) && force >= MUCH.1 * scales.force
     })

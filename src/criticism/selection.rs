@@ -9,6 +9,7 @@ use super::numbers::{Addition, Numbers, Workshop};
 use super::rest::RestReadings;
 use super::signature::{Probes, Ranked, probes, start_by_direction};
 use crate::inference::Failure;
+use crate::math::median;
 use crate::mechanism::effects::{EffectKind, TableKind};
 use crate::model::{BatchFit, BatchWindow, Hypothesis};
 
@@ -60,8 +61,9 @@ const GLANCE: (usize, usize) = (4, 1);
 const REFITTED_OF_CHAINS: usize = 3;
 /// Friction that was not declared starts from these shares of a joint's usual force, near what is known and far
 /// from it.
-const FRICTION_STARTS: [f64; 3] = [0.3, 0.1, 0.03];
-/// κ of the starts far from what is known.
+const FRICTION_STARTS: [f64; 2] = [0.3, 0.1];
+/// The same of starts far from it with much process noise, and their κ.
+const WIDE_FRICTION: f64 = 0.03;
 const WIDE_SCALES: [f64; 2] = [1e3, 1e5];
 /// What is part of something richer is added first if it explains this share of what that does.
 const SIMPLER_SHARE: f64 = 0.3;
@@ -111,6 +113,21 @@ pub struct Component {
 }
 
 impl Selection {
+    /// κ of the windows that move a joint, or of all.
+    pub fn noise_scales_of(&self, joint: Option<usize>) -> Vec<f64> {
+        let concerned = self.components.iter().filter(|c| joint.is_none_or(|joint| c.joints.contains(&joint)));
+        let fits = concerned.filter_map(|component| component.fitted.as_ref());
+        fits.flat_map(|fitted| &fitted.windows).map(|window| window.noise_scale).collect()
+    }
+
+    /// The same with κ changed.
+    fn with_noise_scales(&self, change: impl Fn(f64) -> f64) -> Self {
+        let mut other = self.clone();
+        let fits = other.components.iter_mut().filter_map(|component| component.fitted.as_mut());
+        fits.flat_map(|fitted| &mut fitted.windows).for_each(|window| window.noise_scale = change(window.noise_scale));
+        other
+    }
+
     fn note_step(&mut self) {
         self.stages.push(Step { additions: self.additions.clone(), numbers: self.numbers.clone() });
     }
@@ -169,7 +186,7 @@ impl Trial {
     /// Variance and correlation of its innovations beyond what they should be, of the usual window.
     fn reduction(&self) -> f64 {
         let windows = self.fits.iter().flat_map(|(_, fitted)| &fitted.windows);
-        crate::math::median(windows.map(|window| window.reduction).collect()).unwrap_or(1.0)
+        median(windows.map(|window| window.reduction).collect()).unwrap_or(1.0)
     }
 
     /// How many numbers it adds.
@@ -454,24 +471,26 @@ impl Selector<'_> {
             let force = self.workshop.learner.joint_scales(joint, self.workshop.fit).map_or(1.0, |s| s.force);
             vec![(share * force).ln()]
         };
-        let together = |from: &Selection, share: f64, start: Vec<f64>| {
+        let together = |from: Selection, share: f64, start: Vec<f64>| {
             let also = candidate.also.iter().map(|(other, _)| match other {
                 Addition::Friction(joint) => (*other, friction(*joint, share)),
                 _ => (*other, Vec::new()),
             });
-            (from.clone(), Ranked { start, also: also.collect(), ..candidate.clone() })
+            (from, Ranked { start, also: also.collect(), ..candidate.clone() })
         };
-        let from_both = || [current, &bland].into_iter().zip(FRICTION_STARTS);
+        let from_both = || [current, &bland].into_iter().cloned().zip(FRICTION_STARTS);
         // On several joints far from what is known the way is rough; with wide process noise it is smoother.
-        let wide = WIDE_SCALES.map(|scale| with_scale(&bland, scale));
-        let from_all = || from_both().chain(wide.iter().map(|from| (from, FRICTION_STARTS[2])));
+        let from_all = || {
+            let wide = WIDE_SCALES.into_iter().map(|scale| (bland.with_noise_scales(|_| scale), WIDE_FRICTION));
+            from_both().chain(wide)
+        };
         let starts: Vec<(Selection, Ranked)> = match candidate.addition {
             Addition::Delay if candidate.also.is_empty() => {
                 let delays = || DELAYS.into_iter().chain(candidate.start.first().copied());
                 alone([current, &bland].into_iter().flat_map(|from| delays().map(move |d| (from, d))).collect())
             }
             Addition::Delay => from_all()
-                .flat_map(|(from, share)| NEAR_DELAYS.map(|delay| together(from, share, vec![delay])))
+                .flat_map(|(from, share)| NEAR_DELAYS.map(|delay| together(from.clone(), share, vec![delay])))
                 .collect(),
             Addition::Friction(joint) if !candidate.also.is_empty() => {
                 from_all().map(|(from, share)| together(from, share, friction(joint, share))).collect()
@@ -481,11 +500,15 @@ impl Selector<'_> {
             }
             // Far from where friction and an offset are: with wide process noise the way there is smoother.
             Addition::Effect(_, EffectKind::AsymmetricFriction) if !self.several() => {
-                [current.clone(), widened(current)].into_iter().map(|from| (from, candidate.clone())).collect()
+                [current.clone(), current.with_noise_scales(|scale| scale * WIDENED)]
+                    .into_iter()
+                    .map(|from| (from, candidate.clone()))
+                    .collect()
             }
             // The numbers of a model that is far off mislead.
-            _ if !self.several() && self.noise(current, candidate.addition) >= FAR_OFF => {
-                [current.clone(), with_scale(&bland, FIRST_SCALES[0])].map(|from| (from, candidate.clone())).into()
+            addition if !self.several() && far_off(current, addition) => {
+                let anew = bland.with_noise_scales(|_| FIRST_SCALES[0]);
+                [current.clone(), anew].map(|from| (from, candidate.clone())).into()
             }
             _ => return self.trial(current, candidate, if self.several() { GLANCE } else { REFIT }),
         };
@@ -503,15 +526,6 @@ impl Selector<'_> {
             spent += self.refine(&mut best)?;
         }
         Ok(Trial { spent, ..best })
-    }
-
-    /// κ of the windows that an addition concerns, at the median.
-    fn noise(&self, current: &Selection, addition: Addition) -> f64 {
-        let concerned =
-            |c: &&Component| addition.joint().is_none_or(|joint| c.joints.contains(&joint)) && c.fitted.is_some();
-        let fits = current.components.iter().filter(concerned).filter_map(|c| c.fitted.as_ref());
-        let scales: Vec<f64> = fits.flat_map(|f| &f.windows).map(|window| window.noise_scale).collect();
-        crate::math::median(scales).unwrap_or(1.0)
     }
 
     /// Whether several joints move in a window.
@@ -931,30 +945,14 @@ impl Selector<'_> {
     }
 }
 
-/// The same with larger κ.
-fn widened(selection: &Selection) -> Selection {
-    let mut wide = selection.clone();
-    for fitted in wide.components.iter_mut().filter_map(|component| component.fitted.as_mut()) {
-        for window in &mut fitted.windows {
-            window.noise_scale *= WIDENED;
-        }
-    }
-    wide
-}
-
-/// The same with this κ.
-fn with_scale(selection: &Selection, scale: f64) -> Selection {
-    let mut other = selection.clone();
-    for fitted in other.components.iter_mut().filter_map(|component| component.fitted.as_mut()) {
-        fitted.windows.iter_mut().for_each(|window| window.noise_scale = scale);
-    }
-    other
+/// Whether the windows that an addition concerns are usually explained by noise.
+fn far_off(current: &Selection, addition: Addition) -> bool {
+    median(current.noise_scales_of(addition.joint())).is_some_and(|scale| scale >= FAR_OFF)
 }
 
 /// Whether a window that moves a joint needs far more process noise than the sensor explains.
 fn misfits(current: &Selection, joint: usize) -> bool {
-    let concerned = current.components.iter().filter(|c| c.joints.contains(&joint));
-    concerned.filter_map(|c| c.fitted.as_ref()).flat_map(|f| &f.windows).any(|w| w.noise_scale >= MISFIT)
+    current.noise_scales_of(Some(joint)).into_iter().any(|scale| scale >= MISFIT)
 }
 
 /// Whether a trial is the simpler one of two of which the other has all that it has: friction in all that

@@ -55,23 +55,18 @@ impl<T: Real> SolveScratch<T> {
     /// Derivatives of the rates, in place, from those of the impulses, after a regular step.
     pub fn carry(&self, impulses: &mut [T]) {
         let m = self.slipping.len();
-        let mut right = [T::zero(); SMALL];
-        let mut long = Vec::new();
-        let right = if m <= SMALL {
-            &mut right[..m]
-        } else {
-            long.resize(m, T::zero());
-            &mut long[..]
-        };
-        right.iter_mut().zip(&self.slipping).for_each(|(own, &j)| *own = impulses[j]);
-        substitute(&self.factor, right, m);
-        impulses.fill(T::zero());
-        right.iter().zip(&self.slipping).for_each(|(own, &j)| impulses[j] = *own);
+        // They are in ascending order: those that slip move up to the front, and back again.
+        for (i, &j) in self.slipping.iter().enumerate() {
+            impulses[i] = impulses[j];
+        }
+        substitute(&self.factor, impulses, m);
+        impulses[m..].fill(T::zero());
+        for (i, &j) in self.slipping.iter().enumerate().rev() {
+            impulses.swap(i, j);
+        }
     }
 }
 
-/// Joints that need no memory of their own.
-const SMALL: usize = 8;
 /// Rounds of sweeps and Newton step before the last guess is taken; enough for random problems of
 /// six joints and condition number 10⁴ (test `many_joints_meet_the_law`).
 const ROUNDS_MAX: usize = 100;

@@ -155,8 +155,9 @@ fn step_with_slopes(
     }
     workspace.by_parameter.resize_mut(n, parameters.len(), 0.0);
     workspace.by_parameter.fill(0.0);
+    let mut own = vec![0.0; n];
     for (parameter, mut column) in parameters.iter().zip(workspace.by_parameter.column_iter_mut()) {
-        let (mut own, column) = (vec![0.0; n], column.as_mut_slice());
+        let column = column.as_mut_slice();
         for &(k, inertia) in &parameter.inertias {
             workspace.dynamics.inertia_slope(tree, plain, (k, &inertia), column);
         }

@@ -9,6 +9,7 @@
 //! The state holds the contact point's constant error beside (q, q̇). Derivatives are for fixed gains,
 //! by forward mode for one joint and by the structure of the equations for several.
 
+use std::borrow::Cow;
 use std::cell::RefCell;
 
 use nalgebra::{DMatrix, DVector, Vector3};
@@ -197,15 +198,13 @@ impl WindowModel<'_> {
             if k > 0 {
                 let span = [observations[k - 1].time_s, observation.time_s];
                 let before = state.rows(0, 2 * n).into_owned();
-                let spread = spread_of(&covariance, n);
                 let (next, derivatives) = self.advance_with_slopes(&slopes, &before, span, p)?;
                 state.rows_mut(0, 2 * n).copy_from(&next);
-                let at = derivatives.ncols() - 2 * n;
                 let mut transition = DMatrix::identity(size, size);
-                transition.view_mut((0, 0), (2 * n, 2 * n)).copy_from(&derivatives.columns(at, 2 * n));
+                transition.view_mut((0, 0), (2 * n, 2 * n)).copy_from(&derivatives.columns(p, 2 * n));
                 let ends = [before.as_slice(), next.as_slice()];
-                let carried = self.over_spread(&slopes, transition.clone(), ends, &spread, span)?;
-                covariance = &carried * covariance * carried.transpose();
+                let carried = self.over_spread(&slopes, &transition, ends, &covariance, span)?;
+                covariance = &*carried * covariance * carried.transpose();
                 let mut own = covariance.view_mut((0, 0), (2 * n, 2 * n));
                 own += noise.over(span, &self.all_positions(state.as_slice()), self)?;
                 advance = Some(Advance { transition, derivatives });
@@ -268,13 +267,13 @@ impl WindowModel<'_> {
             if let (Some(from_s), Some(last)) = (before_s, steps.last()) {
                 let span = [from_s, observation.time_s];
                 let moved = last.updated.rows(0, 2 * n).into_owned();
-                let spread = spread_of(&last.updated_covariance, n);
                 let (next, derivatives) = self.advance_with_slopes(&slopes, &moved, span, 0)?;
                 predicted.copy_from(&last.updated);
                 predicted.rows_mut(0, 2 * n).copy_from(&next);
                 transition.view_mut((0, 0), (2 * n, 2 * n)).copy_from(&derivatives.columns(0, 2 * n));
                 let ends = [moved.as_slice(), next.as_slice()];
-                transition = self.over_spread(&slopes, transition, ends, &spread, span)?;
+                let carried = self.over_spread(&slopes, &transition, ends, &last.updated_covariance, span)?;
+                transition = carried.into_owned();
                 covariance = &transition * &last.updated_covariance * transition.transpose();
                 let mut own = covariance.view_mut((0, 0), (2 * n, 2 * n));
                 own += noise.over(span, &self.all_positions(predicted.as_slice()), self)?;
@@ -430,45 +429,37 @@ impl WindowModel<'_> {
         Ok((passage.after, passage.derivatives))
     }
 
-    /// The transition of a covariance whose rates have the standard deviations `spread`: a joint of a chain that
+    /// The transition of a covariance from the one of a state: a joint of a chain that
     /// sticks forgets its rate, but not if it may well be moving, so that differences are taken over what the
     /// rate may be (Norgaard, Poulsen, Ravn, Automatica 36, 2000), unless all joints go on as they go. `ends` are
     /// (q, q̇) before and after the span.
-    fn over_spread(
+    fn over_spread<'t>(
         &self,
         slopes: &Slopes,
-        mut transition: DMatrix<f64>,
+        transition: &'t DMatrix<f64>,
         ends: [&[f64]; 2],
-        spread: &[f64],
+        covariance: &DMatrix<f64>,
         span: [f64; 2],
-    ) -> Result<DMatrix<f64>, Failure> {
-        let Slopes::Chain(chain) = slopes else { return Ok(transition) };
+    ) -> Result<Cow<'t, DMatrix<f64>>, Failure> {
+        let Slopes::Chain(chain) = slopes else { return Ok(Cow::Borrowed(transition)) };
+        let spread = spread_of(covariance, self.moving.len());
         let [before, after] = ends.map(|end| &end[spread.len()..]);
         let goes_on = |i: usize| before[i] * after[i] > 0.0 && before[i].abs().min(after[i].abs()) > CLEAR * spread[i];
         if (0..spread.len()).all(goes_on) {
-            return Ok(transition);
+            return Ok(Cow::Borrowed(transition));
         }
-        let state = DVector::from_column_slice(ends[0]);
+        let mut transition = transition.clone();
         for (i, deviation) in spread.iter().enumerate() {
             let (rate, by) = (spread.len() + i, deviation.max(DIFFERENCE));
-            let [after, before] = [by, -by].map(|by| self.advance_moved(&chain.plant, &state, (rate, by), span));
-            let slope = (after? - before?) / (2.0 * by);
-            transition.view_mut((0, rate), (state.len(), 1)).copy_from(&slope);
+            let moved = |by: f64| {
+                let mut start = ends[0].to_vec();
+                start[rate] += by;
+                self.advance(&chain.plant, &start, span).map(DVector::from_vec)
+            };
+            let slope = (moved(by)? - moved(-by)?) / (2.0 * by);
+            transition.view_mut((0, rate), (slope.len(), 1)).copy_from(&slope);
         }
-        Ok(transition)
-    }
-
-    /// The state after a span from one that is moved in one of its entries.
-    fn advance_moved(
-        &self,
-        plant: &Plant<f64>,
-        state: &DVector<f64>,
-        (entry, by): (usize, f64),
-        span: [f64; 2],
-    ) -> Result<DVector<f64>, Failure> {
-        let mut start = state.clone();
-        start[entry] += by;
-        Ok(DVector::from_vec(self.advance(plant, start.as_slice(), span)?))
+        Ok(Cow::Owned(transition))
     }
 
     /// [`Self::advance_with_slopes`] where several joints move.
