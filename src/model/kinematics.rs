@@ -18,6 +18,7 @@ use serde::{Deserialize, Serialize};
 use super::window::{Contact, PoseMeasurement, WindowObservations, with_shared_error};
 use crate::math::{Pose, Screw, in_lengths, length_scale, orthonormal_pair};
 use crate::mechanism::JointType;
+use crate::registration::Suggestion;
 use crate::types::Label;
 
 /// Standard deviations \[m\] of the rigid error that the first look's faces share once the part has
@@ -38,6 +39,11 @@ const REST_BLOCKS: usize = 6;
 /// Score at which rest is given up: far beyond χ² with `REST_BLOCKS` degrees of freedom, as frames
 /// are not independent.
 const REST_SCORE: f64 = 40.0;
+/// A fit whose cost falls by less \[nats\] has settled; before the joints' rests are known, roughly.
+const SETTLED: f64 = 1e-3;
+const ROUGHLY_SETTLED: f64 = 0.03;
+/// The same as a share of the cost.
+const RELATIVELY_SETTLED: f64 = 1e-6;
 
 /// A joint axis in world at the reference configuration.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -73,7 +79,7 @@ pub struct KinematicJoint {
     /// Length that makes rotations of the child comparable with translations \[m\].
     pub radius: f64,
     /// The nearest direction that the shape suggests for the axis (a face's normal), if any.
-    pub suggested: Option<Vector3<f64>>,
+    pub suggested: Option<Suggestion>,
 }
 
 impl KinematicJoint {
@@ -116,16 +122,16 @@ impl KinematicJoint {
     /// coordinates \[rad\], with the information of that suggestion.
     ///
     /// Mechanisms are mostly built along faces, but not always: with even odds the axis is within
-    /// `ALIGNED_SIGMA` of the suggestion, or anywhere. `spread` is the variance of the direction by
+    /// `ALIGNED_SIGMA` of one of all suggestions, or anywhere. `spread` is the variance of the direction by
     /// the data alone \[rad²\].
     fn alignment(&self, spread: f64) -> Option<([f64; 2], f64)> {
-        let suggested = self.suggested?;
-        let suggested = suggested * suggested.dot(&self.axis.direction).signum();
+        let Suggestion { direction, share } = self.suggested?;
+        let suggested = direction * direction.dot(&self.axis.direction).signum();
         let turn = self.axis.direction.cross(&suggested);
         let (first, second) = orthonormal_pair(&self.axis.direction);
         let angle_squared = turn.norm_squared();
         let variance = ALIGNED_SIGMA.powi(2) + spread;
-        let log_odds = -0.5 * angle_squared / variance - variance.ln();
+        let log_odds = share.ln() - 0.5 * angle_squared / variance - variance.ln();
         let share = 1.0 / (1.0 + (-log_odds).exp());
         Some(([turn.dot(&first), turn.dot(&second)], share / ALIGNED_SIGMA.powi(2)))
     }
@@ -299,7 +305,8 @@ fn solved(mut problem: Problem<'_>) -> (Problem<'_>, f64, bool) {
             let trial_of_windows = trial.windows_cost();
             let trial_cost = trial.prior_cost() + trial_of_windows;
             if trial_cost.is_finite() && trial_cost <= cost_before + 1e-9 {
-                converged = cost_before - trial_cost < 1e-6 * (1.0 + cost_before.abs());
+                let least = if tied { SETTLED } else { ROUGHLY_SETTLED };
+                converged = cost_before - trial_cost < least.max(RELATIVELY_SETTLED * cost_before.abs());
                 problem = trial;
                 of_windows = trial_of_windows;
                 damping = (damping * 0.2_f64).max(1e-9);

@@ -21,8 +21,8 @@ use crate::model::{
 };
 use crate::model::{DynamicsInput, DynamicsLearner, DynamicsPosterior, WindowInference};
 use crate::registration::{
-    AlignmentSettings, PartModel, ScanPoint, Surfel, SurfelAccumulator, fit_circle, fit_line, motion_cost, rays_near,
-    thinned_cost,
+    AlignmentSettings, Face, PartModel, ScanPoint, Suggestion, Surfel, SurfelAccumulator, fit_circle, fit_line,
+    motion_cost, rays_near, suggested_direction, thinned_cost,
 };
 use crate::structure::TreeDistribution;
 use crate::types::posterior::WindowRecord;
@@ -33,8 +33,6 @@ pub(super) const MOVED: f64 = 0.006;
 
 /// A part that stays within this of its place on its parent rests there \[m\].
 const RESTS: f64 = 1e-6;
-/// A face's normal suggests an axis within 15° of it.
-const SUGGESTION_COSINE: f64 = 0.966;
 /// Visible surfaces of parts that are joined are this close \[m\]; the joint itself is mostly hidden.
 const CONTACT_GAP: f64 = 0.03;
 /// Standard deviation of what occlusion adds to that \[m\].
@@ -159,9 +157,9 @@ pub struct Learner {
     /// Where each part was when each window's scans were measured last.
     #[serde(skip)]
     pub(super) measured_at: BTreeMap<Label, Vec<Vec<Pose>>>,
-    /// Normals of the faces of each part's first look, once they were asked for.
+    /// The faces of each part's first look, once they were asked for.
     #[serde(skip)]
-    face_normals: BTreeMap<Label, Vec<Vector3<f64>>>,
+    faces: BTreeMap<Label, Vec<Face>>,
     /// Where each model has its keyframes.
     #[serde(skip)]
     built_at: BTreeMap<Label, Vec<Option<Pose>>>,
@@ -224,7 +222,7 @@ impl Learner {
             kept_windows: usize::MAX,
             kept: Vec::new(),
             measured_at: BTreeMap::new(),
-            face_normals: BTreeMap::new(),
+            faces: BTreeMap::new(),
             built_at: BTreeMap::new(),
             gaps,
             baselines: BTreeMap::new(),
@@ -834,8 +832,8 @@ impl Learner {
     fn fit_joints(&mut self) {
         let tree = self.likeliest();
         for label in tree.iter().map(|(child, ..)| *child).chain([self.root]) {
-            if let (None, Some(model)) = (self.face_normals.get(&label), self.models.get(&label)) {
-                self.face_normals.insert(label, model.face_normals());
+            if let (None, Some(model)) = (self.faces.get(&label), self.models.get(&label)) {
+                self.faces.insert(label, model.faces());
             }
         }
         let index = |label: Label| tree.iter().position(|(l, ..)| *l == label);
@@ -864,7 +862,7 @@ impl Learner {
                     axis: Axis { direction: axis.direction * sign(joint), ..*axis },
                     center: part.center,
                     radius: part.radius,
-                    suggested: self.suggested_direction(*child, *parent, &axis.direction),
+                    suggested: self.suggestion(*child, *parent, &axis.direction),
                 }
             })
             .collect();
@@ -902,23 +900,10 @@ impl Learner {
         self.fit = Some(fit);
     }
 
-    /// The direction nearest to an axis among the normals of the faces of the part, its parent and the
-    /// root, and their common perpendiculars; `None` beyond 15°.
-    fn suggested_direction(&self, child: Label, parent: Option<Label>, axis: &Vector3<f64>) -> Option<Vector3<f64>> {
-        let labels = [Some(child), parent, Some(self.root)];
-        let mut candidates = Vec::new();
-        for label in labels.into_iter().flatten() {
-            let normals = self.face_normals.get(&label).map_or(&[][..], Vec::as_slice);
-            for (i, first) in normals.iter().enumerate() {
-                candidates.push(*first);
-                candidates.extend(normals[..i].iter().filter_map(|second| {
-                    let cross = first.cross(second);
-                    (cross.norm() > 0.98).then(|| cross.normalize())
-                }));
-            }
-        }
-        let nearest = candidates.into_iter().max_by(|a, b| a.dot(axis).abs().total_cmp(&b.dot(axis).abs()))?;
-        (nearest.dot(axis).abs() > SUGGESTION_COSINE).then_some(nearest)
+    /// What the faces of a part, its parent and the root suggest for the part's axis.
+    fn suggestion(&self, child: Label, parent: Option<Label>, axis: &Vector3<f64>) -> Option<Suggestion> {
+        let labels: BTreeSet<Label> = [Some(child), parent, Some(self.root)].into_iter().flatten().collect();
+        suggested_direction(labels.iter().filter_map(|label| self.faces.get(label).map(Vec::as_slice)), axis)
     }
 
     /// Keeps scans of the parts that moved, and grows their models.

@@ -7,6 +7,7 @@
 
 mod align;
 mod articulated;
+mod faces;
 mod factor;
 mod field;
 mod outline;
@@ -15,6 +16,7 @@ mod surfels;
 
 pub use align::{Alignment, align, follow};
 pub use articulated::{JointFrame, JointPath, search_path};
+pub use faces::{Face, Suggestion, suggested_direction};
 pub use factor::{
     AlignmentSettings, FromBehind, OUTLIER_COST, PoseFactor, Quadratic, motion_cost, pose_factor, thinned_cost,
     truncated_cost,

@@ -21,12 +21,6 @@ const SNAP_COSINE: f64 = 0.94;
 const PLANE_SURFELS: usize = 20;
 /// A part needs this many surfels to be registered.
 const FEWEST_SURFELS: usize = 20;
-/// A flat face is this many surfels of one plane.
-const FACE_SURFELS: usize = 40;
-/// A plane is the edge of a face with this many times its surfels, if its normal is between 2° and 15° off.
-const EDGE_SHARE: usize = 3;
-const SAME_FACE_COSINE: f64 = 0.9994;
-const EDGE_COSINE: f64 = 0.966;
 /// A later surfel this far from those of the first look is a new face \[m\].
 const NEW_FACE_DISTANCE: f64 = 0.015;
 /// Viewing directions are told apart by the nearest of the 12 vertices of an icosahedron.
@@ -367,54 +361,5 @@ impl PartModel {
     /// A sphere about the centroid that holds the part, and a margin \[m\].
     pub fn reach(&self) -> f64 {
         self.surfels.iter().map(|s| (s.point - self.centroid).norm()).fold(0.0, f64::max) + 0.05
-    }
-
-    /// Normals of the large flat faces seen at the first look, up to sign.
-    ///
-    /// Normals are fitted over a radius, so edges grow planes of their own, a few degrees off the face they
-    /// belong to: such a plane is no face.
-    pub fn face_normals(&self) -> Vec<Vector3<f64>> {
-        let mut faces: Vec<(Vector3<f64>, usize)> = Vec::new();
-        for surfel in self.surfels.iter().filter(|s| !s.grown) {
-            match faces.iter_mut().find(|(normal, _)| normal.dot(&surfel.normal).abs() > 1.0 - 1e-9) {
-                Some((_, count)) => *count += 1,
-                None => faces.push((surfel.normal, 1)),
-            }
-        }
-        let is_edge_of = |(normal, count): &(Vector3<f64>, usize), (other, surfels): &(Vector3<f64>, usize)| {
-            let cosine = normal.dot(other).abs();
-            *surfels >= EDGE_SHARE * count && cosine > EDGE_COSINE && cosine < SAME_FACE_COSINE
-        };
-        let is_face = |face: &&(Vector3<f64>, usize)| {
-            face.1 >= FACE_SURFELS && !faces.iter().any(|other| is_edge_of(face, other))
-        };
-        faces.iter().filter(is_face).map(|(normal, _)| *normal).collect()
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// A square of `side` × `side` surfels, its normal so many degrees off the vertical.
-    fn square(side: u32, at: f64, tilt_deg: f64) -> impl Iterator<Item = Surfel> {
-        let normal = Vector3::new(tilt_deg.to_radians().sin(), 0.0, tilt_deg.to_radians().cos());
-        let along = Vector3::new(normal.z, 0.0, -normal.x);
-        (0..side * side).map(move |i| {
-            let point = along * (at + 0.01 * f64::from(i % side)) + Vector3::y() * (0.01 * f64::from(i / side));
-            Surfel { point, normal, sigma: 0.002, sided: true, grown: false }
-        })
-    }
-
-    #[test]
-    fn what_an_edge_makes_of_a_face_is_no_face() {
-        let normals = |tilt_deg: f64, side: u32| {
-            let surfels: Vec<Surfel> = square(30, 0.0, 0.0).chain(square(side, 0.3, tilt_deg)).collect();
-            PartModel::new(&surfels).expect("enough surfels").face_normals().len()
-        };
-        assert_eq!(normals(6.7, 8), 1, "a rim of the large face");
-        assert_eq!(normals(0.3, 8), 2, "the same face seen from another side");
-        assert_eq!(normals(40.0, 8), 2, "a bevel");
-        assert_eq!(normals(6.7, 25), 2, "two faces of a size");
     }
 }
