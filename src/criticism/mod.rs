@@ -21,6 +21,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::{Deserialize, Serialize};
 
 use crate::inference::Failure;
+use crate::mechanism::JointType;
 use crate::model::{BatchWindow, DynamicsInput, DynamicsLearner, Hypothesis, KinematicFit};
 use crate::types::Label;
 use crate::types::posterior::{Criticism, Verdict};
@@ -44,7 +45,13 @@ pub struct Critic {
     known: Option<(Vec<Label>, Numbers)>,
     /// The models on the way to the last selection.
     stages: Vec<Step>,
+    /// What the last review looked at.
+    reviewed: Vec<Reviewed>,
 }
+
+/// A window under review, whatever its place among those that are kept: when it begins \[s\], and which joints
+/// of which types move in it.
+type Reviewed = (f64, Vec<(Label, JointType)>);
 
 /// A model on the way from the declared physics to what was selected, fitted to all windows.
 #[derive(Clone, Debug)]
@@ -81,6 +88,14 @@ impl Critic {
         }
         let batch = learner.batch(fit, input, MOST_WINDOWS);
         if batch.is_empty() {
+            return Ok(0);
+        }
+        let joint = |k: &usize| (fit.joints[*k].child, fit.joints[*k].joint_type);
+        let looked_at = |w: &BatchWindow| {
+            (input.windows[w.index].times_s.first().copied().unwrap_or(0.0), w.moving.iter().map(joint).collect())
+        };
+        let reviewed: Vec<Reviewed> = batch.iter().map(looked_at).collect();
+        if reviewed == self.reviewed {
             return Ok(0);
         }
         let rest = RestReadings::of(&batch, input, &SENSOR_SCALES);
@@ -185,6 +200,7 @@ impl Critic {
         self.stages.clone_from(&selected.stages);
         self.findings = Some(findings);
         self.selection = Some(selected);
+        self.reviewed = reviewed;
         Ok(steps)
     }
 }

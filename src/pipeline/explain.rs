@@ -223,14 +223,16 @@ fn explain_window(scene: &Scene<'_>, measured: &BTreeMap<Label, Motion>) -> BTre
     let mut offers = Offers::default();
     let mut order = Vec::new();
     while !open.is_empty() {
-        scene.prepare(&open, &motions, &mut offers);
-        let best = open
+        // A part goes along with the one that is known to carry it: that is explained first.
+        let waits = |label: &Label| scene.known_parent(*label).is_some_and(|parent| open.contains(&parent));
+        let ready: Vec<Label> = open.iter().copied().filter(|label| !waits(label)).collect();
+        scene.prepare(&ready, &motions, &mut offers);
+        let best = ready
             .iter()
-            .enumerate()
-            .filter_map(|(index, &label)| Some((index, scene.best_motion(label, &motions, &offers)?)))
+            .filter_map(|&label| Some((label, scene.best_motion(label, &motions, &offers)?)))
             .min_by(|(_, a), (_, b)| a.score.total_cmp(&b.score));
-        let Some((index, motion)) = best else { break };
-        let label = open.remove(index);
+        let Some((label, motion)) = best else { break };
+        open.retain(|other| *other != label);
         motions.insert(label, scene.accepted(label, motion));
         order.push(label);
     }
@@ -430,6 +432,12 @@ impl<'a> Scene<'a> {
             held && (known_joint || motion.excess < EXPLAINED || motion.excess < 0.3 * still.excess)
         });
         (best.motion, settled)
+    }
+
+    /// The part that carries another by the joints known so far.
+    fn known_parent(&self, label: Label) -> Option<Label> {
+        let joint = self.joints.iter().find(|joint| joint.child == label)?;
+        joint.parent.map(|parent| self.joints[parent].child)
     }
 
     /// What a part may hang on: the world, what moves, and what was moved before.

@@ -47,6 +47,9 @@ const LEAST_DOUBT: f64 = 1e-3;
 const REBUILT: f64 = 0.0003;
 /// Hypotheses this far behind are not sought from new starts \[nats\].
 const HOPELESS: f64 = 100.0;
+/// A hypothesis that trails by more is left as it is \[nats\].
+const OUT_OF_REACH: f64 = 300.0;
+const MOVING_TYPES: [JointType; 2] = [JointType::Prismatic, JointType::Revolute];
 /// Windows whose frames are kept for measuring again, of at most so many points in all: 84 MB.
 const KEPT_FRAMES: usize = 8;
 const KEPT_POINTS: usize = 1_500_000;
@@ -625,12 +628,27 @@ impl Learner {
             edges.extend(movers.iter().filter(|l| **l != child).map(|l| (child, Some(*l))));
         }
         // Collected in the order of `edges`, so threads do not show in the result.
-        let options: Vec<ParentEvidence> = edges
+        let mut options: Vec<ParentEvidence> = edges
             .par_iter()
             .map(|&(child, parent)| {
-                self.unaffected(child, parent, motions).unwrap_or_else(|| self.weigh_edge(child, parent, motions))
+                let old = self.unaffected(child, parent, motions);
+                old.unwrap_or_else(|| self.weigh_edge(child, parent, motions, true))
             })
             .collect();
+        // More windows only take away from evidence: what was left as it was is weighed after all where the best
+        // has come down to it.
+        let mut best: BTreeMap<Label, f64> = BTreeMap::new();
+        for ((child, _), option) in edges.iter().zip(&options) {
+            let best = best.entry(*child).or_insert(f64::NEG_INFINITY);
+            *best = option.log_evidence.into_iter().fold(*best, f64::max);
+        }
+        for (&(child, parent), option) in edges.iter().zip(&mut options) {
+            let near = |t: &JointType| option.log_evidence[*t as usize] > best[&child] - HOPELESS;
+            let left = MOVING_TYPES.iter().filter(|t| self.trails(child, parent, **t, OUT_OF_REACH));
+            if left.into_iter().any(near) && self.unaffected(child, parent, motions).is_none() {
+                *option = self.weigh_edge(child, parent, motions, false);
+            }
+        }
         let mut evidence: BTreeMap<Label, Vec<ParentEvidence>> = BTreeMap::new();
         for ((child, _), option) in edges.into_iter().zip(options) {
             tracing::debug!(%child, parent = ?option.parent, evidence = ?option.log_evidence, "edge");
@@ -639,7 +657,19 @@ impl Learner {
         self.evidence = evidence;
     }
 
-    fn weigh_edge(&self, child: Label, parent: Option<Label>, motions: &BTreeMap<Label, Motion>) -> ParentEvidence {
+    /// Evidence of one parent. `lazy`: what is out of reach stays as it was, which is more than it would come to.
+    fn weigh_edge(
+        &self,
+        child: Label,
+        parent: Option<Label>,
+        motions: &BTreeMap<Label, Motion>,
+        lazy: bool,
+    ) -> ParentEvidence {
+        let left = |joint_type: JointType| lazy && self.trails(child, parent, joint_type, OUT_OF_REACH);
+        let old = self.old_evidence(child, parent);
+        if let Some(old) = old.filter(|_| MOVING_TYPES.into_iter().all(left)) {
+            return self.prolonged(old);
+        }
         let windows: Vec<&WindowObservations> = self.windows.iter().collect();
         let part = self.part(child);
         let carrier = parent.map(|p| self.part(p));
@@ -651,13 +681,17 @@ impl Learner {
         let past = self.past_evidence(child, parent);
         let log_evidence = past.map(|past| past + rigid);
         let mut option = ParentEvidence { parent, log_evidence, fits: [None, None, None], rigid_by_window, past };
-        for joint_type in [JointType::Prismatic, JointType::Revolute] {
-            let mut starts = self.start_axes(&part, parent, joint_type, &relative, motions);
-            if self.is_hopeless(child, parent, joint_type) {
-                starts.truncate(1);
-            }
-            let fit = moving_evidence(&part, joint_type, &starts, (&relative, &resting), &self.settings, &shared);
+        for joint_type in MOVING_TYPES {
             let slot = joint_type as usize;
+            let fit = if left(joint_type) {
+                old.and_then(|old| self.prolonged(old).fits[slot].take())
+            } else {
+                let mut starts = self.start_axes(&part, parent, joint_type, &relative, motions);
+                if self.trails(child, parent, joint_type, HOPELESS) {
+                    starts.truncate(1);
+                }
+                moving_evidence(&part, joint_type, &starts, (&relative, &resting), &self.settings, &shared)
+            };
             if let Some(mut fit) = fit {
                 self.keep_sign(&mut fit, child, parent);
                 option.log_evidence[slot] = option.log_evidence[slot].max(past[slot] + fit.log_evidence);
@@ -667,15 +701,18 @@ impl Learner {
         option
     }
 
-    /// Whether a hypothesis trails the child's best so far by more than another start would find: it is
-    /// refitted from where it was.
-    fn is_hopeless(&self, child: Label, parent: Option<Label>, joint_type: JointType) -> bool {
+    /// What was known of an edge before this window.
+    fn old_evidence(&self, child: Label, parent: Option<Label>) -> Option<&ParentEvidence> {
+        self.evidence.get(&child)?.iter().find(|option| option.parent == parent)
+    }
+
+    /// Whether a hypothesis that was fitted trailed the child's best by more than so much.
+    fn trails(&self, child: Label, parent: Option<Label>, joint_type: JointType, by: f64) -> bool {
         let options = self.evidence.get(&child).map_or(&[][..], Vec::as_slice);
         let best = options.iter().flat_map(|option| option.log_evidence).fold(f64::NEG_INFINITY, f64::max);
-        options.iter().find(|option| option.parent == parent).is_some_and(|option| {
-            let slot = joint_type as usize;
-            option.fits[slot].is_some() && option.log_evidence[slot] < best - HOPELESS
-        })
+        let slot = joint_type as usize;
+        self.old_evidence(child, parent)
+            .is_some_and(|option| option.fits[slot].is_some() && option.log_evidence[slot] < best - by)
     }
 
     /// Turns a fit the way the one before counted: an axis's sign is free, but what was learned goes by it.
@@ -714,14 +751,19 @@ impl Learner {
         if moved(child) || parent.is_some_and(moved) {
             return None;
         }
-        let mut old = self.evidence.get(&child)?.iter().find(|o| o.parent == parent)?.clone();
+        self.old_evidence(child, parent).map(|old| self.prolonged(old))
+    }
+
+    /// Evidence to which the newest window adds nothing.
+    fn prolonged(&self, old: &ParentEvidence) -> ParentEvidence {
+        let mut old = old.clone();
         old.rigid_by_window.push(0.0);
         for fit in old.fits.iter_mut().flatten() {
             fit.by_window.push(0.0);
             let last = fit.positions.last().and_then(|w| w.last()).copied().unwrap_or(0.0);
             fit.positions.push(vec![last; self.windows.last().map_or(0, |w| w.times_s.len())]);
         }
-        Some(old)
+        old
     }
 
     fn start_axes(
