@@ -39,11 +39,6 @@ const REST_BLOCKS: usize = 6;
 /// Score at which rest is given up: far beyond χ² with `REST_BLOCKS` degrees of freedom, as frames
 /// are not independent.
 const REST_SCORE: f64 = 40.0;
-/// A fit whose cost falls by less \[nats\] has settled; before the joints' rests are known, roughly.
-const SETTLED: f64 = 1e-3;
-const ROUGHLY_SETTLED: f64 = 0.03;
-/// The same as a share of the cost.
-const RELATIVELY_SETTLED: f64 = 1e-6;
 
 /// A joint axis in world at the reference configuration.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -305,8 +300,7 @@ fn solved(mut problem: Problem<'_>) -> (Problem<'_>, f64, bool) {
             let trial_of_windows = trial.windows_cost();
             let trial_cost = trial.prior_cost() + trial_of_windows;
             if trial_cost.is_finite() && trial_cost <= cost_before + 1e-9 {
-                let least = if tied { SETTLED } else { ROUGHLY_SETTLED };
-                converged = cost_before - trial_cost < least.max(RELATIVELY_SETTLED * cost_before.abs());
+                converged = cost_before - trial_cost < 1e-6 * (1.0 + cost_before.abs());
                 problem = trial;
                 of_windows = trial_of_windows;
                 damping = (damping * 0.2_f64).max(1e-9);

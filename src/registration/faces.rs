@@ -52,8 +52,7 @@ impl PartModel {
             let cosine = face.normal.dot(&other.normal).abs();
             other.surfels >= EDGE_SHARE * face.surfels && cosine > EDGE_COSINE && cosine < SAME_FACE_COSINE
         };
-        let is_face =
-            |face: &&Face| face.surfels >= FACE_SURFELS && !faces.iter().any(|other| is_edge_of(face, other));
+        let is_face = |face: &&Face| face.surfels >= FACE_SURFELS && !faces.iter().any(|other| is_edge_of(face, other));
         faces.iter().filter(is_face).copied().collect()
     }
 }
@@ -77,8 +76,7 @@ pub fn suggested_direction<'a>(parts: impl Iterator<Item = &'a [Face]>, axis: &V
         candidates[own..].iter_mut().for_each(|(_, area)| *area /= total);
         groups += usize::from(candidates.len() > own);
     }
-    let (direction, _) =
-        *candidates.iter().max_by(|(a, _), (b, _)| a.dot(axis).abs().total_cmp(&b.dot(axis).abs()))?;
+    let (direction, _) = *candidates.iter().max_by(|(a, _), (b, _)| a.dot(axis).abs().total_cmp(&b.dot(axis).abs()))?;
     let same = candidates.iter().filter(|(other, _)| other.dot(&direction).abs() > SAME_DIRECTION_COSINE);
     let share = same.map(|(_, area)| area).sum::<f64>() / groups as f64;
     (direction.dot(axis).abs() > SUGGESTION_COSINE).then_some(Suggestion { direction, share })
