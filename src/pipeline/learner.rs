@@ -122,6 +122,9 @@ pub struct Learner {
     /// Where each part was when each window's scans were measured last.
     #[serde(skip)]
     pub(super) measured_at: BTreeMap<Label, Vec<Vec<Pose>>>,
+    /// Where each part was in each window when all its edges were weighed last.
+    #[serde(skip)]
+    pub(super) weighed_at: BTreeMap<Label, Vec<Vec<Pose>>>,
     /// The faces of each part's first look, once they were asked for.
     #[serde(skip)]
     faces: BTreeMap<Label, Vec<Face>>,
@@ -187,6 +190,7 @@ impl Learner {
             kept_windows: usize::MAX,
             kept: Vec::new(),
             measured_at: BTreeMap::new(),
+            weighed_at: BTreeMap::new(),
             faces: BTreeMap::new(),
             built_at: BTreeMap::new(),
             gaps,
@@ -528,7 +532,7 @@ impl Learner {
             .filter(|&w| self.kept[w].iter().any(|frame| frame.scans.contains_key(&label)))
             .filter(|&w| {
                 let Some(before) = self.measured_at.get(&label).and_then(|m| m.get(w)) else { return false };
-                before.iter().zip(&self.tracks[&label][w]).any(|(old, new)| travel(model, old, new) > MEASURED_AGAIN)
+                is_elsewhere(model, before, &self.tracks[&label][w])
             })
             .collect();
         for w in elsewhere {
@@ -696,6 +700,11 @@ impl Learner {
             self.built_at.insert(label, places);
         }
     }
+}
+
+/// Whether a part's track is not where it was, far enough for its scans to be measured again.
+fn is_elsewhere(model: &PartModel, before: &[Pose], track: &[Pose]) -> bool {
+    before.iter().zip(track).any(|(old, new)| travel(model, old, new) > MEASURED_AGAIN)
 }
 
 /// Smallest distance between the surfels of each pair of parts \[m\].

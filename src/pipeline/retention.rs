@@ -94,6 +94,7 @@ impl Learner {
         }
         drop_at(&mut self.kept, window);
         self.measured_at.values_mut().for_each(|measured| drop_at(measured, window));
+        self.weighed_at.values_mut().for_each(|weighed| drop_at(weighed, window));
         self.windows.remove(window);
     }
 

@@ -1,12 +1,12 @@
 //! Weighs every parent and joint type of every part that moved, and reads the likeliest tree off them.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{DMatrix, Vector3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::{Learner, RESTS};
+use super::{Learner, RESTS, is_elsewhere};
 use crate::math::{Pose, log_sum_exp};
 use crate::mechanism::JointType;
 use crate::model::{
@@ -68,16 +68,20 @@ impl Learner {
             edges.push((child, None));
             edges.extend(movers.iter().filter(|l| **l != child).map(|l| (child, Some(*l))));
         }
+        let stirred = self.stirred(&movers);
+        let is_stirred = |child: Label, parent: Option<Label>| {
+            stirred.contains(&child) || parent.is_some_and(|parent| stirred.contains(&parent))
+        };
         // Collected in the order of `edges`, so threads do not show in the result.
         let mut options: Vec<ParentEvidence> = edges
             .par_iter()
             .map(|&(child, parent)| {
                 let old = self.unaffected(child, parent, motions);
-                old.unwrap_or_else(|| self.weigh_edge(child, parent, motions, true))
+                old.unwrap_or_else(|| self.weigh_edge(child, parent, motions, !is_stirred(child, parent)))
             })
             .collect();
-        // More windows only take away from evidence: what was left as it was is weighed after all where the best
-        // has come down to it.
+        // More windows only take away from evidence, where the parts still are where they were in those before: what
+        // was left as it was is weighed after all where the best has come down to it.
         let mut best: BTreeMap<Label, f64> = BTreeMap::new();
         for ((child, _), option) in edges.iter().zip(&options) {
             let best = best.entry(*child).or_insert(f64::NEG_INFINITY);
@@ -86,7 +90,10 @@ impl Learner {
         for (&(child, parent), option) in edges.iter().zip(&mut options) {
             let near = |t: &JointType| option.log_evidence[*t as usize] > best[&child] - HOPELESS;
             let left = MOVING_TYPES.iter().filter(|t| self.trails(child, parent, **t, OUT_OF_REACH));
-            if left.into_iter().any(near) && self.unaffected(child, parent, motions).is_none() {
+            if !is_stirred(child, parent)
+                && left.into_iter().any(near)
+                && self.unaffected(child, parent, motions).is_none()
+            {
                 *option = self.weigh_edge(child, parent, motions, false);
             }
         }
@@ -96,6 +103,24 @@ impl Learner {
             evidence.entry(child).or_default().push(option);
         }
         self.evidence = evidence;
+    }
+
+    /// The parts that are not where they were in a window when their edges were weighed, or that were never weighed.
+    fn stirred(&mut self, movers: &[Label]) -> BTreeSet<Label> {
+        let mut stirred = BTreeSet::new();
+        for &label in movers {
+            let (model, tracks) = (&self.models[&label], &self.tracks[&label]);
+            let weighed = self.weighed_at.entry(label).or_default();
+            let stands = !weighed.is_empty()
+                && weighed.iter().zip(tracks).all(|(before, track)| !is_elsewhere(model, before, track));
+            if stands {
+                weighed.extend_from_slice(&tracks[weighed.len().min(tracks.len())..]);
+            } else {
+                weighed.clone_from(tracks);
+                stirred.insert(label);
+            }
+        }
+        stirred
     }
 
     /// Evidence of one parent. `lazy`: what is out of reach stays as it was, which is more than it would come to.
