@@ -26,6 +26,8 @@ const JUMP: f64 = 0.02;
 const KEPT: f64 = 0.6;
 /// A scan's mean goes this far by what of the part is seen \[m\].
 const MEAN_WENT: f64 = 0.02;
+/// Parts found anew within this span, further apart than this, show a rate between them \[s, m\].
+const FOUND_AGAIN: (f64, f64) = (0.6, 0.02);
 /// A scan that is lost is looked for this far turned away from where it was \[rad\].
 const TURN: f64 = 0.25;
 
@@ -50,12 +52,15 @@ pub(super) struct Whereabouts {
     means: BTreeMap<Label, Vector3<f64>>,
     /// Where parts were left.
     places: BTreeMap<Label, Pose>,
+    /// When a part was last looked for along its joint, and where it was found \[s; m or rad\].
+    found: BTreeMap<Label, (f64, f64)>,
 }
 
 impl Whereabouts {
     /// A new posterior: its joints start anew, and parts are where it left them.
     pub fn restart(&mut self, places: BTreeMap<Label, Pose>) {
         self.places = places;
+        self.found.clear();
         for presence in self.presences.values_mut() {
             presence.clear(Account::Joint);
             presence.clear(Account::Place);
@@ -171,7 +176,15 @@ impl Whereabouts {
                 let free = FreePart::followed(poses, model.centroid, model.radius, &[]);
                 filter.place(body, q, 0.0);
                 let center = free.displacement.transform_point(&filter.mechanism().centers[body]);
-                let rate = filter.rate_of(body, &free.velocity_at(&center));
+                let mut rate = filter.rate_of(body, &free.velocity_at(&center));
+                // What moves though its joint says that it rests is found again and again.
+                if let Some((then_s, there)) = self.found.insert(label, (frame.time_s, q))
+                    && frame.time_s - then_s < FOUND_AGAIN.0
+                    && (q - there).abs() * filter.mechanism().reach(body) > FOUND_AGAIN.1
+                    && rate == 0.0
+                {
+                    rate = (q - there) / (frame.time_s - then_s).max(1e-3);
+                }
                 filter.place(body, q, rate);
                 presence.clear(Account::Joint);
             }
