@@ -228,12 +228,13 @@ impl Filter {
         self.held
     }
 
-    /// Joints that stay: at rest, and not between the world and what is held. Friction holds them, or
-    /// they would not rest; a model that says otherwise is wrong.
+    /// Joints that stay: at rest, not between the world and what is held, and carried by nothing that moves,
+    /// whose jerks they would feel. Friction holds them, or they would not rest; a model that says otherwise
+    /// is wrong.
     pub(super) fn resting(&self) -> Vec<(usize, f64)> {
-        let driven = self.held.map(|held| self.mechanism.chain(held.body)).unwrap_or_default();
-        let rests = |joint: &usize| self.state.rates[*joint] == 0.0 && !driven.contains(joint);
-        (0..self.mechanism.joints.len()).filter(rests).map(|joint| (joint, self.state.positions[joint])).collect()
+        let moving = self.moving_joints();
+        let joints = (0..self.mechanism.joints.len()).filter(|joint| !moving.contains(joint));
+        joints.map(|joint| (joint, self.state.positions[joint])).collect()
     }
 
     /// Displacements of the parts whose joints are trusted.
@@ -321,14 +322,9 @@ impl Filter {
 
     /// Parts that may move, with their displacements: those that the tool's hold or a rate reaches.
     pub fn moving_parts(&self) -> Vec<(Label, Pose)> {
-        let driven = self.held.map(|held| self.mechanism.chain(held.body)).unwrap_or_default();
-        let moves = |joint: usize| driven.contains(&joint) || self.state.rates[joint] != 0.0;
         let displacements = self.mechanism.tree.displacements(&self.state.positions);
-        let joints = self.mechanism.joints.iter().zip(displacements).enumerate();
-        joints
-            .filter(|(body, _)| self.mechanism.chain(*body).into_iter().any(moves))
-            .map(|(_, (joint, displacement))| (joint.child, displacement))
-            .collect()
+        let moving = self.moving_joints().into_iter();
+        moving.map(|body| (self.mechanism.joints[body].child, displacements[body])).collect()
     }
 
     /// The tool takes hold of a part where it is now; its position is reported with `sigma_m`.
@@ -497,11 +493,12 @@ impl Filter {
         }
     }
 
-    /// Joints between the world and what is held, and those with a rate.
+    /// Joints between the world and what is held, those with a rate, and those that either carries.
     pub(super) fn moving_joints(&self) -> Vec<usize> {
         let driven = self.held.map(|held| self.mechanism.chain(held.body)).unwrap_or_default();
-        let n = self.mechanism.joints.len();
-        (0..n).filter(|joint| driven.contains(joint) || self.state.rates[*joint] != 0.0).collect()
+        let moves = |joint: usize| driven.contains(&joint) || self.state.rates[joint] != 0.0;
+        let chain = |joint: &usize| self.mechanism.chain(*joint);
+        (0..self.mechanism.joints.len()).filter(|joint| chain(joint).into_iter().any(moves)).collect()
     }
 
     /// Places of positions, rates, disturbances and numbers of some joints.
