@@ -59,7 +59,8 @@ const EXPLAINED: f64 = 0.005;
 const FURTHEST: f64 = 0.05;
 /// Softest standard deviation of the point first held, beside the tool's own \[m\].
 const HELD_DEVIATION: f64 = 0.0005;
-/// χ² of three numbers beyond which a tool that does not push has let go: one in a hundred.
+/// χ² of three numbers beyond which a tool that does not push says nothing of the part, which may have left
+/// it: one in a hundred.
 const LET_GO: f64 = 11.3;
 /// No part of an object that arms move is faster than this \[m/s\]: it is what falls by one metre.
 pub(super) const FASTEST: f64 = 4.4;
@@ -647,11 +648,9 @@ impl Filter {
         self.correct_by_point(tool_in_world, sigma_m, true)
     }
 
-    /// The same by a tool that does not push: it may have let go, and has if the part is elsewhere.
-    pub fn correct_by_idle_tool(&mut self, tool_in_world: &Vector3<f64>, sigma_m: f64) {
-        if self.held.is_some() && !self.correct_by_point(tool_in_world, sigma_m, false) {
-            self.release();
-        }
+    /// The same by a tool that does not push: the part may have left it, and then it says nothing.
+    pub fn correct_by_idle_tool(&mut self, tool_in_world: &Vector3<f64>, sigma_m: f64) -> bool {
+        self.correct_by_point(tool_in_world, sigma_m, false)
     }
 
     fn correct_by_point(&mut self, tool_in_world: &Vector3<f64>, sigma_m: f64, pushes: bool) -> bool {

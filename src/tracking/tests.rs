@@ -268,16 +268,16 @@ proptest! {
 }
 
 #[test]
-fn a_hand_that_goes_without_pushing_has_let_go() {
+fn a_hand_that_goes_without_pushing_takes_nothing_along() {
     let (mut filter, _) = filtered(drawer(8.0));
     let there = filter.positions()[0];
-    assert!(filter.held().is_some());
     let tool = CONTACT + drawer(8.0).tool_offset + Vector3::x() * there;
-    filter.correct_by_idle_tool(&tool, 0.001);
-    assert!(filter.held().is_some(), "it is where it was");
-    filter.correct_by_idle_tool(&(tool + Vector3::x() * 0.03), 0.001);
-    assert!(filter.held().is_none());
+    assert!(filter.correct_by_idle_tool(&tool, 0.001), "it is where it was");
+    assert!(!filter.correct_by_idle_tool(&(tool + Vector3::x() * 0.03), 0.001));
     assert!((filter.positions()[0] - there).abs() < 0.002, "{} m, was {there} m", filter.positions()[0]);
+    // One that pushes has it along.
+    assert!(filter.correct_by_tool(&(tool + Vector3::x() * 0.03), 0.001));
+    assert!((filter.positions()[0] - there - 0.03).abs() < 0.01, "{} m, was {there} m", filter.positions()[0]);
 }
 
 #[test]
