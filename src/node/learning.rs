@@ -7,7 +7,7 @@ use anyhow::Context as _;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use thread_priority::{
     NormalThreadSchedulePolicy, RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue,
-    ThreadSchedulePolicy, set_thread_priority_and_policy, thread_native_id, thread_schedule_policy,
+    ThreadSchedulePolicy, set_thread_priority_and_policy, thread_native_id,
 };
 
 use super::health::{SharedHealth, now};
@@ -15,10 +15,11 @@ use crate::pipeline::{ClosedWindow, FirstLook, Learned, Looked, Worker};
 
 /// Windows that wait at most; one more, and the oldest that waits is dropped and counted.
 const MOST_WAITING: usize = 4;
-/// How much tracking goes before other programs and inference after them, in nice's steps.
-const NICENESS: (i32, i32) = (-10, 3);
+/// How much tracking goes before other programs and inference after them, in nice's steps: a tenth of the
+/// share of what is not nice. Less, and beside busy programs inference would starve.
+const NICENESS: (i32, i32) = (-10, 10);
 /// The latter, of 0 to 99.
-const NICE_PRIORITY: u8 = 40;
+const NICE_PRIORITY: u8 = 23;
 
 /// What there is to learn.
 enum Work {
@@ -196,15 +197,12 @@ pub fn go_first() {
     }
 }
 
-/// Lets the stream go first.
+/// Lets the stream go first: a batch, which takes the processor from nothing that wakes up, and nice.
 pub fn give_way() {
-    if let (Ok(ThreadSchedulePolicy::Realtime(_)), Ok(priority)) =
-        (thread_schedule_policy(), ThreadPriorityValue::try_from(NICE_PRIORITY))
-    {
-        let normal = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Other);
-        let priority = ThreadPriority::Crossplatform(priority);
+    let batch = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Batch);
+    if let Ok(priority) = ThreadPriorityValue::try_from(NICE_PRIORITY) {
         // It may always be given up.
-        let _ = set_thread_priority_and_policy(thread_native_id(), priority, normal);
+        let _ = set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(priority), batch);
     }
     let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS.1);
 }

@@ -582,9 +582,11 @@ fn follow(
         if touch.begins {
             filter.trust();
         }
-        if touch.begins || filter.held().is_none_or(|held| held.body != body) {
+        if touch.begins || (touch.pushes && filter.held().is_none_or(|held| held.body != body)) {
             *denials = 0;
             filter.hold(body, &touch.tool_in_world, seen.tool_sigma);
+        } else if learner.use_tool && !touch.pushes {
+            filter.correct_by_idle_tool(&touch.tool_in_world, seen.tool_sigma);
         } else if learner.use_tool {
             if filter.correct_by_tool(&touch.tool_in_world, seen.tool_sigma) {
                 *denials = 0;
@@ -592,11 +594,9 @@ fn follow(
                 *denials += 1;
                 if *denials >= DENIALS {
                     *denials = 0;
-                    if touch.pushes {
-                        // It is held, and not where the model has it: for now, it goes as the tool does.
-                        filter.distrust(body);
-                        filter.hold(body, &touch.tool_in_world, seen.tool_sigma);
-                    }
+                    // It is held, and not where the model has it: for now, it goes as the tool does.
+                    filter.distrust(body);
+                    filter.hold(body, &touch.tool_in_world, seen.tool_sigma);
                 }
             }
         }

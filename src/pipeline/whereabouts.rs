@@ -26,6 +26,10 @@ const JUMP: f64 = 0.02;
 const KEPT: f64 = 0.6;
 /// A scan's mean goes this far by what of the part is seen \[m\].
 const MEAN_WENT: f64 = 0.02;
+/// A part found anew this soon after it was where its joint had it, and this far from there, moves \[s, m\].
+const FOUND_AGAIN: (f64, f64) = (0.6, 0.015);
+/// Excess cost below which a part is where its joint has it.
+const IN_PLACE: f64 = 0.05;
 /// A scan that is lost is looked for this far turned away from where it was \[rad\].
 const TURN: f64 = 0.25;
 
@@ -50,12 +54,15 @@ pub(super) struct Whereabouts {
     means: BTreeMap<Label, Vector3<f64>>,
     /// Where parts were left.
     places: BTreeMap<Label, Pose>,
+    /// When and where a part last was on its joint, as seen or as found anew \[s; m or rad\].
+    found: BTreeMap<Label, (f64, f64)>,
 }
 
 impl Whereabouts {
     /// A new posterior: its joints start anew, and parts are where it left them.
     pub fn restart(&mut self, places: BTreeMap<Label, Pose>) {
         self.places = places;
+        self.found.clear();
         for presence in self.presences.values_mut() {
             presence.clear(Account::Joint);
             presence.clear(Account::Place);
@@ -157,6 +164,9 @@ impl Whereabouts {
             else {
                 continue;
             };
+            if presence.excess(Account::Joint).is_some_and(|excess| excess < IN_PLACE) {
+                self.found.insert(label, (frame.time_s, filter.positions()[body]));
+            }
             if !presence.is_lost(Account::Joint) || scan.len() < FEWEST_POINTS {
                 continue;
             }
@@ -171,7 +181,15 @@ impl Whereabouts {
                 let free = FreePart::followed(poses, model.centroid, model.radius, &[]);
                 filter.place(body, q, 0.0);
                 let center = free.displacement.transform_point(&filter.mechanism().centers[body]);
-                let rate = filter.rate_of(body, &free.velocity_at(&center));
+                let mut rate = filter.rate_of(body, &free.velocity_at(&center));
+                // Registration may have stayed at where the joint had it.
+                if let Some((then_s, there)) = self.found.insert(label, (frame.time_s, q))
+                    && frame.time_s - then_s < FOUND_AGAIN.0
+                    && (q - there).abs() * filter.mechanism().reach(body) > FOUND_AGAIN.1
+                    && rate == 0.0
+                {
+                    rate = (q - there) / (frame.time_s - then_s).max(1e-3);
+                }
                 filter.place(body, q, rate);
                 presence.clear(Account::Joint);
             }

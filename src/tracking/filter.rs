@@ -59,6 +59,16 @@ const EXPLAINED: f64 = 0.005;
 const FURTHEST: f64 = 0.05;
 /// Softest standard deviation of the point first held, beside the tool's own \[m\].
 const HELD_DEVIATION: f64 = 0.0005;
+/// χ² of three numbers beyond which a tool that does not push says nothing of the part, which may have left
+/// it: one in a hundred.
+const LET_GO: f64 = 11.3;
+/// No part of an object that arms move is faster than this \[m/s\]: it is what falls by one metre.
+pub(super) const FASTEST: f64 = 4.4;
+/// A joint is no further than this beyond where measurements have had it \[m\], nor a held point from
+/// where it was taken hold of: what is left of doubt is looked for, not integrated.
+pub(super) const LEASH: f64 = 0.5;
+/// The tool's track moves no number of the dynamics further than this from its posterior.
+const NUMBER_FURTHEST: f64 = 2.0;
 
 /// What the tool holds.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -94,6 +104,8 @@ pub struct Filter {
     /// Of (positions, rates, held point, disturbance, active numbers).
     pub(super) covariance: DMatrix<f64>,
     pub(super) held: Option<Held>,
+    /// The held point as it was when the tool took hold of it.
+    first_held: Vector3<f64>,
     workspace: Workspace<f64>,
     inertias: Vec<f64>,
     /// Factor on the process noise while innovations are larger than expected.
@@ -112,6 +124,22 @@ pub struct Filter {
 /// Standard deviation of the unexplained force on a joint \[N or N·m\].
 fn disturbance_deviation(mechanism: &TrackedMechanism, tree: &Tree<f64>, joint: usize) -> f64 {
     (DISTURBANCE * tree.bodies()[joint].parameters.friction).hypot(mechanism.unexplained[joint])
+}
+
+/// Lowers the standard deviation of one coordinate to `most` where it is larger, its correlations as they
+/// are; one that is no number becomes `most` and correlates with nothing.
+pub(super) fn limit_deviation(covariance: &mut DMatrix<f64>, at: usize, most: f64) {
+    if !covariance.row(at).iter().chain(covariance.column(at).iter()).all(|x| x.is_finite()) {
+        covariance.row_mut(at).fill(0.0);
+        covariance.column_mut(at).fill(0.0);
+        covariance[(at, at)] = most * most;
+        return;
+    }
+    let deviation = covariance[(at, at)].max(0.0).sqrt();
+    if deviation > most {
+        covariance.row_mut(at).scale_mut(most / deviation);
+        covariance.column_mut(at).scale_mut(most / deviation);
+    }
 }
 
 impl Filter {
@@ -157,6 +185,7 @@ impl Filter {
             state,
             covariance,
             held: None,
+            first_held: Vector3::zeros(),
             workspace,
             inertias,
             unease: 1.0,
@@ -200,12 +229,13 @@ impl Filter {
         self.held
     }
 
-    /// Joints that stay: at rest, and not between the world and what is held. Friction holds them, or
-    /// they would not rest; a model that says otherwise is wrong.
+    /// Joints that stay: at rest, not between the world and what is held, and carried by nothing that moves,
+    /// whose jerks they would feel. Friction holds them, or they would not rest; a model that says otherwise
+    /// is wrong.
     pub(super) fn resting(&self) -> Vec<(usize, f64)> {
-        let driven = self.held.map(|held| self.mechanism.chain(held.body)).unwrap_or_default();
-        let rests = |joint: &usize| self.state.rates[*joint] == 0.0 && !driven.contains(joint);
-        (0..self.mechanism.joints.len()).filter(rests).map(|joint| (joint, self.state.positions[joint])).collect()
+        let moving = self.moving_joints();
+        let joints = (0..self.mechanism.joints.len()).filter(|joint| !moving.contains(joint));
+        joints.map(|joint| (joint, self.state.positions[joint])).collect()
     }
 
     /// Displacements of the parts whose joints are trusted.
@@ -261,6 +291,7 @@ impl Filter {
         }
         self.covariance[(body, body)] = (SEARCH_STEP / self.mechanism.reach(body)).powi(2);
         self.covariance[(n + body, n + body)] = (0.5 * rate).powi(2);
+        self.bound();
     }
 
     /// What moves a body is not as the mechanism says: it stops, and is not forecast.
@@ -292,14 +323,9 @@ impl Filter {
 
     /// Parts that may move, with their displacements: those that the tool's hold or a rate reaches.
     pub fn moving_parts(&self) -> Vec<(Label, Pose)> {
-        let driven = self.held.map(|held| self.mechanism.chain(held.body)).unwrap_or_default();
-        let moves = |joint: usize| driven.contains(&joint) || self.state.rates[joint] != 0.0;
         let displacements = self.mechanism.tree.displacements(&self.state.positions);
-        let joints = self.mechanism.joints.iter().zip(displacements).enumerate();
-        joints
-            .filter(|(body, _)| self.mechanism.chain(*body).into_iter().any(moves))
-            .map(|(_, (joint, displacement))| (joint.child, displacement))
-            .collect()
+        let moving = self.moving_joints().into_iter();
+        moving.map(|body| (self.mechanism.joints[body].child, displacements[body])).collect()
     }
 
     /// The tool takes hold of a part where it is now; its position is reported with `sigma_m`.
@@ -324,6 +350,7 @@ impl Filter {
     pub fn hold_point(&mut self, body: usize, point: Vector3<f64>, sigma_m: f64) {
         self.release();
         self.held = Some(Held { body, point });
+        self.first_held = point;
         let n = self.mechanism.joints.len();
         for i in 2 * n..2 * n + 3 {
             self.covariance[(i, i)] = sigma_m.powi(2);
@@ -393,20 +420,86 @@ impl Filter {
             }
         }
         let mut cursor = self.cursor;
+        let before = self.state.positions.clone();
         let disturbance = self.disturbance.clone();
         let scratch = (&mut self.workspace, &mut cursor);
         drive.run(&mut self.tree, &mut self.state, span, &disturbance, scratch);
         self.cursor = cursor;
         self.time_s = to_s;
+        if !self.state.positions.iter().chain(&self.state.rates).all(|x| x.is_finite()) {
+            let count = before.len();
+            self.state = State::new(before, vec![0.0; count]);
+        }
         self.grow(&joints, &coordinates, &slopes, span[1] - span[0]);
         self.fade(span[1] - span[0]);
+        self.bound();
     }
 
-    /// Joints between the world and what is held, and those with a rate.
+    /// Keeps the state to what parts can do, and its spread to what may be doubted: a simulation of numbers
+    /// that no part has, or a correction by a covariance that is nearly singular, leads anywhere.
+    fn bound(&mut self) {
+        let n = self.mechanism.joints.len();
+        let (mut positions, mut rates) = (self.state.positions.clone(), self.state.rates.clone());
+        for joint in 0..n {
+            let (least, most) = self.farthest(joint);
+            let fastest = FASTEST / self.mechanism.reach(joint);
+            positions[joint] = positions[joint].clamp(least, most);
+            rates[joint] = rates[joint].clamp(-fastest, fastest);
+            // What has come to its leash goes no further.
+            let outward =
+                (positions[joint] <= least && rates[joint] < 0.0) || (positions[joint] >= most && rates[joint] > 0.0);
+            if outward {
+                rates[joint] = 0.0;
+            }
+        }
+        if positions != self.state.positions || rates != self.state.rates {
+            self.state = State::new(positions, rates);
+        }
+        if let Some(held) = &mut self.held {
+            let way = held.point - self.first_held;
+            let size = way.norm();
+            if size > LEASH {
+                held.point = self.first_held + way * (LEASH / size);
+            }
+        }
+        for at in 0..self.covariance.nrows() {
+            let most = if at < n {
+                LEASH / self.mechanism.reach(at)
+            } else if at < 2 * n {
+                FASTEST / self.mechanism.reach(at - n)
+            } else if at < 2 * n + 3 {
+                LEASH
+            } else if at < 3 * n + 3 {
+                continue;
+            } else {
+                NUMBER_FURTHEST
+            };
+            limit_deviation(&mut self.covariance, at, most);
+        }
+    }
+
+    /// Least and greatest position that a joint can be at, by where measurements have had it.
+    pub(super) fn farthest(&self, joint: usize) -> (f64, f64) {
+        let leash = LEASH / self.mechanism.reach(joint);
+        let [low, high] = self.explored[joint];
+        (low - leash, high + leash)
+    }
+
+    /// A measurement had these joints where they are.
+    fn confirm(&mut self, joints: &[usize]) {
+        for &joint in joints {
+            let q = self.state.positions[joint];
+            let seen = &mut self.explored[joint];
+            *seen = [seen[0].min(q), seen[1].max(q)];
+        }
+    }
+
+    /// Joints between the world and what is held, those with a rate, and those that either carries.
     pub(super) fn moving_joints(&self) -> Vec<usize> {
         let driven = self.held.map(|held| self.mechanism.chain(held.body)).unwrap_or_default();
-        let n = self.mechanism.joints.len();
-        (0..n).filter(|joint| driven.contains(joint) || self.state.rates[*joint] != 0.0).collect()
+        let moves = |joint: usize| driven.contains(&joint) || self.state.rates[joint] != 0.0;
+        let chain = |joint: &usize| self.mechanism.chain(*joint);
+        (0..self.mechanism.joints.len()).filter(|joint| chain(joint).into_iter().any(moves)).collect()
     }
 
     /// Places of positions, rates, disturbances and numbers of some joints.
@@ -552,6 +645,15 @@ impl Filter {
 
     /// Corrects by the tool's position \[m\] with its noise; false if the held part cannot be there.
     pub fn correct_by_tool(&mut self, tool_in_world: &Vector3<f64>, sigma_m: f64) -> bool {
+        self.correct_by_point(tool_in_world, sigma_m, true)
+    }
+
+    /// The same by a tool that does not push: the part may have left it, and then it says nothing.
+    pub fn correct_by_idle_tool(&mut self, tool_in_world: &Vector3<f64>, sigma_m: f64) -> bool {
+        self.correct_by_point(tool_in_world, sigma_m, false)
+    }
+
+    fn correct_by_point(&mut self, tool_in_world: &Vector3<f64>, sigma_m: f64, pushes: bool) -> bool {
         let Some(held) = self.held else { return false };
         let n = self.mechanism.joints.len();
         let displacement = self.mechanism.tree.displacements(&self.state.positions)[held.body];
@@ -566,6 +668,9 @@ impl Filter {
         let Some(inverse) = spread.try_inverse() else { return false };
         let squared = innovation.dot(&(inverse * innovation));
         let slopes = jacobian.view((0, 0), (3, n)).into_owned();
+        if !pushes && squared > LET_GO {
+            return false;
+        }
         if squared > GATE && !self.give_way(&slopes, &innovation) {
             return false;
         }
@@ -581,6 +686,10 @@ impl Filter {
         let Some(inverse) = spread.try_inverse() else { return false };
         let inverse = DMatrix::from_column_slice(3, 3, inverse.as_slice());
         self.correct(&jacobian, &inverse, &DVector::from_column_slice(innovation.as_slice()));
+        // Of several joints it does not tell which has moved.
+        if let [joint] = self.mechanism.chain(held.body)[..] {
+            self.confirm(&[joint]);
+        }
         true
     }
 
@@ -627,7 +736,8 @@ impl Filter {
                 + noise;
         let Some(mut inverse) = spread.try_inverse() else { return };
         let innovation = SVector::<f64, 6>::from(-residual);
-        if innovation.dot(&(inverse * innovation)) > GATE {
+        let surprising = innovation.dot(&(inverse * innovation)) > GATE;
+        if surprising {
             for joint in mechanism.chain(body) {
                 let reach = mechanism.reach(joint);
                 self.covariance[(joint, joint)] += (0.01 / reach).powi(2);
@@ -652,6 +762,9 @@ impl Filter {
         self.state = State::new(self.state.positions.clone(), self.state.rates.clone());
         for joint in 0..n {
             self.corrected_rates[joint] = self.state.rates[joint].abs();
+        }
+        if !surprising {
+            self.confirm(&mechanism.chain(body));
         }
     }
 
@@ -688,16 +801,16 @@ impl Filter {
             self.covariance[(i, i)] = self.covariance[(i, i)].max(0.0);
         }
         self.change_numbers(&change);
-        for (seen, q) in self.explored.iter_mut().zip(&self.state.positions) {
-            *seen = [seen[0].min(*q), seen[1].max(*q)];
-        }
+        self.bound();
     }
 
     fn change_numbers(&mut self, change: &DVector<f64>) {
         let first = 3 * self.mechanism.joints.len() + 3;
         let mut numbers = self.numbers.clone();
         for (i, number) in self.mechanism.active.iter().enumerate() {
-            numbers[number.place] += change[first + i].clamp(-NUMBER_DEVIATION.1, NUMBER_DEVIATION.1);
+            let moved = numbers[number.place] + change[first + i].clamp(-NUMBER_DEVIATION.1, NUMBER_DEVIATION.1);
+            let mean = self.mechanism.numbers[number.place];
+            numbers[number.place] = moved.clamp(mean - NUMBER_FURTHEST, mean + NUMBER_FURTHEST);
         }
         if numbers == self.numbers {
             return;

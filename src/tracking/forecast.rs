@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 
-use super::filter::{FORCE_DENSITY, Filter, STEP, Start};
+use super::filter::{self, FORCE_DENSITY, Filter, LEASH, STEP, Start, limit_deviation};
 use super::free::FADE;
 use super::mechanism::TrackedMechanism;
 use super::simulation::Drive;
@@ -55,16 +55,18 @@ impl Filter {
             path = self.simulate(&[], &times_s, samples, STEP).unwrap_or_else(stay);
             errors = self.spread(&path, &times_s, samples);
         }
-        let forecast = |(positions, mut errors): (&Vec<f64>, DMatrix<f64>)| {
+        let forecast = |((positions, mut errors), time_s): ((&Vec<f64>, DMatrix<f64>), &f64)| {
             let (positions, variances) = self.before_unknown_stops(positions);
             for (joint, variance) in variances.iter().enumerate() {
                 errors[(joint, joint)] += variance;
+                let most = LEASH + 2.0 * filter::FASTEST * (time_s - self.time_s);
+                limit_deviation(&mut errors, joint, most / self.mechanism.reach(joint));
             }
             let spread = |body| center_covariance(&self.mechanism, body, &positions, &errors);
             let covariances_m2 = (0..n).map(spread).collect();
             Forecast { positions, covariances_m2 }
         };
-        path.iter().zip(errors).skip(1).map(forecast).collect()
+        path.iter().zip(errors).zip(&times_s).skip(1).map(forecast).collect()
     }
 
     /// Where each part is expected at a later time under the wrenches read.

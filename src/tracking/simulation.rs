@@ -6,7 +6,7 @@ use crate::mechanism::{State, Step, Tree, Workspace, WrenchPoint, WrenchSample, 
 use crate::model::SensorError;
 
 /// An unexplained force is forgotten within this \[s\]: e^(−t/T).
-pub(super) const DISTURBANCE_MEMORY: f64 = 0.4;
+pub(super) const DISTURBANCE_MEMORY: f64 = 1.0;
 /// Spans over which a disturbance is taken as constant \[s\].
 const CONSTANT: f64 = 0.1;
 

@@ -3,14 +3,15 @@
 
 use std::sync::Arc;
 
-use nalgebra::{DMatrix, DVector, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix6, Vector3};
+use proptest::prelude::*;
 
 use super::{ActiveNumber, Filter, TrackedMechanism, TreeFamily};
 use crate::math::Pose;
 use crate::mechanism::{
     Body, JointParameters, JointType, State, Tree, WrenchPoint, WrenchSample, WrenchTrack, rollout,
 };
-use crate::model::{Axis, KinematicJoint};
+use crate::model::{Axis, KinematicJoint, PoseMeasurement};
 use crate::types::Label;
 
 const CONTACT: Vector3<f64> = Vector3::new(0.5, 0.0, 0.2);
@@ -195,4 +196,104 @@ fn a_joint_carries_the_tool_as_far_as_it_can() {
     let place = carried.displacement.translation;
     assert!((carried.position - 0.15).abs() < 1e-9 && (place - Vector3::x() * 0.15).norm() < 1e-9, "{carried:?}");
     assert!((carried.miss_m - 0.02).abs() < 1e-9, "{carried:?}");
+}
+
+/// A drawer with another on it, of numbers that no part has:
+/// ln damping and ln friction of both, then ln mass.
+fn loose(numbers: [f64; 3], deviation: f64, noise_scale: f64) -> TrackedMechanism {
+    let real = drawer(8.0);
+    let trees = TreeFamily::new(|numbers| {
+        let parameters = || JointParameters::new(numbers[0].exp(), numbers[1].exp());
+        let mass = numbers[2].exp();
+        let first = Body { parameters: parameters(), ..Body::prismatic(None, &Vector3::x(), mass) };
+        let second = Body { parameters: parameters(), ..Body::prismatic(Some(0), &Vector3::x(), mass) };
+        Tree::new(vec![first, second], Vector3::new(0.0, 0.0, -9.81)).ok()
+    });
+    let numbers = DVector::from_vec(numbers.to_vec());
+    let second = KinematicJoint { parent: Some(0), child: Label(5), ..real.joints[0] };
+    TrackedMechanism {
+        joints: vec![real.joints[0], second],
+        tree: trees.tree(&numbers).unwrap(),
+        trees,
+        numbers,
+        active: (0..3).map(|place| ActiveNumber { joint: place % 2, place }).collect(),
+        covariance: DMatrix::identity(3, 3) * deviation * deviation,
+        explored: vec![[0.0, 0.3]; 2],
+        axis_roots: vec![DMatrix::zeros(2, 2); 2],
+        centers: vec![Vector3::zeros(); 2],
+        noise_scale,
+        unexplained: vec![0.0, 100.0],
+        ..real
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+    /// Whatever the numbers, the forces and the measurements: where a part is said to be is where it can be.
+    #[test]
+    fn no_numbers_carry_a_part_away(
+        numbers in (-25.0..5.0, -25.0..3.0, -16.0..3.0),
+        deviation in 0.01..30.0,
+        noise_scale in prop::sample::select(vec![1.0, 1e4, 1e9]),
+        frames in prop::collection::vec((-1e4..1e4, -0.3..0.6, -0.3..0.6, 0..4u8), 12),
+    ) {
+        let mechanism = loose([numbers.0, numbers.1, numbers.2], deviation, noise_scale);
+        let offset = mechanism.tool_offset;
+        let mut filter = Filter::new(Arc::new(mechanism), 0.0, vec![0.1, 0.0], vec![0.3, 0.0], (0.01, 0.1));
+        filter.hold(1, &(CONTACT + Vector3::x() * 0.1 + offset), 0.001);
+        for (frame, (force, tool, pose, what)) in frames.into_iter().enumerate() {
+            let time_s = 0.1 * (frame + 1) as f64;
+            let pull = |stamp_s| WrenchSample { stamp_s, force_in_world: Vector3::x() * force, ..readings()[0] };
+            let samples: Vec<_> = (0..300).map(|i| pull(0.008 * f64::from(i))).collect();
+            filter.advance(time_s, &samples);
+            if what & 1 == 0 {
+                filter.correct_by_tool(&(CONTACT + Vector3::x() * tool + offset), 0.001);
+            }
+            if what & 2 == 0 {
+                let displacement = Pose::from_translation(Vector3::x() * pose);
+                let information = Matrix6::identity() * 1e6;
+                filter.correct_by_pose(Label(4), &PoseMeasurement { displacement, information });
+            }
+            for forecast in filter.forecast(&[0.1, 0.5, 1.0], &samples) {
+                // Measured within 0.6 m, two joints, each seen within as much or so, its leash, and a second.
+                for (q, covariance) in forecast.positions.iter().zip(&forecast.covariances_m2) {
+                    prop_assert!(q.abs() < 6.0, "{q} m at {time_s} s");
+                    let deviation = covariance.trace().sqrt();
+                    prop_assert!(deviation < 25.0, "{deviation} m at {time_s} s");
+                }
+            }
+            prop_assert!(filter.rates().iter().all(|rate| rate.abs() < 5.0), "{:?}", filter.rates());
+        }
+    }
+}
+
+#[test]
+fn a_hand_that_goes_without_pushing_takes_nothing_along() {
+    let (mut filter, _) = filtered(drawer(8.0));
+    let there = filter.positions()[0];
+    let tool = CONTACT + drawer(8.0).tool_offset + Vector3::x() * there;
+    assert!(filter.correct_by_idle_tool(&tool, 0.001), "it is where it was");
+    assert!(!filter.correct_by_idle_tool(&(tool + Vector3::x() * 0.03), 0.001));
+    assert!((filter.positions()[0] - there).abs() < 0.002, "{} m, was {there} m", filter.positions()[0]);
+    // One that pushes has it along.
+    assert!(filter.correct_by_tool(&(tool + Vector3::x() * 0.03), 0.001));
+    assert!((filter.positions()[0] - there - 0.03).abs() < 0.01, "{} m, was {there} m", filter.positions()[0]);
+}
+
+#[test]
+fn what_is_carried_is_left_behind_by_a_jerk() {
+    // 3 kg on 3 kg, hardly any friction between: by 30 N the lower goes, the upper stays in world.
+    let mut mechanism = loose([0.1f64.ln(), 0.5f64.ln(), 3f64.ln()], 0.05, 1.0);
+    mechanism.unexplained = vec![0.0; 2];
+    mechanism.explored = vec![[-1.0, 1.0]; 2];
+    let mut filter = Filter::new(Arc::new(mechanism), 0.0, vec![0.0, 0.0], vec![0.0, 0.0], (0.001, 0.01));
+    filter.hold_point(0, CONTACT, 0.001);
+    let pull = |i| WrenchSample { stamp_s: 0.008 * f64::from(i), force_in_world: Vector3::x() * 30.0, ..readings()[0] };
+    let samples: Vec<_> = (0..100).map(pull).collect();
+    let ahead = filter.forecast(&[0.2], &samples).remove(0);
+    let [lower, upper] = ahead.positions[..] else { panic!("two joints") };
+    assert!(lower > 0.1 && upper < -0.7 * lower, "{lower} m, {upper} m on it");
+    // At rest and let alone, both stay.
+    filter.release();
+    assert_eq!(filter.forecast(&[0.2], &samples).remove(0).positions, [0.0, 0.0]);
 }
