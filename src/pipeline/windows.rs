@@ -166,6 +166,9 @@ impl WindowCutter {
                 previous + (now - previous) * f64::from(i) / f64::from(steps) - 0.5 * self.readings.settings.smoothing_s
             })
             .any(|t| self.readings.active_at(t, None));
+        // What is let go may move on by itself while the tool goes to the next part: two contacts, two windows.
+        let anew = active && self.is_open() && now - self.last_contact_s > self.readings.settings.quiet_s;
+        let let_go = anew.then(|| self.close(previous));
         if active {
             self.last_contact_s = now;
         }
@@ -193,7 +196,8 @@ impl WindowCutter {
         let opened = self.open_since?;
         let settings = &self.readings.settings;
         let quiet = now - self.last_contact_s >= settings.quiet_s && !moving;
-        (quiet || now - opened >= settings.longest_s).then(|| self.close(now))
+        let over = quiet || now - opened >= settings.longest_s;
+        let_go.or_else(|| over.then(|| self.close(now)))
     }
 
     /// The window that is open at the end of the stream.
@@ -225,7 +229,10 @@ impl WindowCutter {
         let last = self.frames.back().cloned();
         let frames = spaced(self.frames.drain(..));
         self.frames.extend(last);
-        let readings = self.readings.clone();
+        let mut readings = self.readings.clone();
+        while readings.wrenches.back().is_some_and(|w| readings.time(w) > now) {
+            readings.wrenches.pop_back();
+        }
         self.forget(now - 1.0);
         CutWindow { frames, readings }
     }
@@ -419,6 +426,37 @@ mod tests {
         assert_eq!(found.len(), 4, "{found:?}");
         assert!(found[0] == 0.0 && (found[3] - 7.0 / 30.0).abs() < 1e-12, "{found:?}");
         assert_eq!(times(60.0, 2, &scans).len(), 2);
+    }
+
+    #[test]
+    fn a_part_that_moves_on_does_not_join_two_contacts() {
+        let mut cutter = WindowCutter::new(WindowSettings::default(), Stamp(0));
+        let mut windows = Vec::new();
+        for k in 0..400_i64 {
+            let time_s = k as f64 * 0.01;
+            let pushed = (1.0..2.0).contains(&time_s) || time_s >= 2.8;
+            cutter.push_wrench(AppliedWrench {
+                stamp: Stamp(k * 10_000_000),
+                source: 0,
+                part: None,
+                tool: true,
+                point_in_world: Vector3::new(if time_s < 2.4 { 0.0 } else { 1.0 }, 0.0, 0.0),
+                force_in_world: Vector3::new(if pushed { 5.0 } else { 0.02 * (k % 3) as f64 }, 0.0, 0.0),
+                torque_in_world: Vector3::zeros(),
+            });
+            if k % 10 == 0 {
+                // What was let go at 2 s has not come to rest by the next contact.
+                let frame = Frame { time_s, ..Frame::default() };
+                windows.extend(cutter.push_frame(frame, time_s > 1.0));
+            }
+        }
+        windows.extend(cutter.flush());
+        let label = |x: &Vector3<f64>, _: &Frame| Some(Label(if x.x < 0.5 { 1 } else { 2 }));
+        let jobs: Vec<WindowJob> = windows.into_iter().map(|window| window.job(label)).collect();
+        let touched: Vec<Vec<Label>> = jobs.iter().map(|job| job.contacts.iter().map(|c| c.label).collect()).collect();
+        assert_eq!(touched, [vec![Label(1)], vec![Label(2)]]);
+        let track = &jobs[0].contacts[0].track;
+        assert!(track.iter().all(|(_, tool, _)| tool.x < 0.5), "{track:?}");
     }
 
     #[test]
