@@ -268,7 +268,6 @@ impl Selector<'_> {
 
     /// The declared physics with the end stops that the windows show.
     pub fn base(&self, numbers: &Numbers) -> Result<Selection, Failure> {
-        let declared = self.workshop.learner.declared_mechanism();
         let mut best: Option<Selection> = None;
         let mut bland = numbers.clone();
         bland.joints.clear();
@@ -289,28 +288,35 @@ impl Selector<'_> {
         }
         let mut current = best.ok_or(Failure::Diverged)?;
         self.settle(&mut current)?;
+        self.add_stops(&mut current);
+        Ok(current)
+    }
+
+    /// Adds the end stops that the windows show by a model: what it lacks may hide them.
+    fn add_stops(&self, current: &mut Selection) {
+        let declared = self.workshop.learner.declared_mechanism();
         for component in current.components.clone() {
             for &joint in &component.joints {
                 let moved = component.windows.iter().any(|&w| self.batch[w].moving.contains(&joint));
                 for upper in [false, true].into_iter().filter(|_| moved) {
                     let stop = Addition::Stop(joint, upper);
-                    if declared.joints[joint].stops[usize::from(upper)] || !self.may_halt(joint, upper) {
+                    let known = declared.joints[joint].stops[usize::from(upper)] || current.additions.contains(&stop);
+                    if known || !self.may_halt(joint, upper) {
                         continue;
                     }
                     let (low, high) = self.workshop.range(joint);
                     let start = vec![if upper { high } else { low }];
                     if let Ok(trial) =
-                        self.trial(&current, &Ranked { addition: stop, gain: 0.0, start, also: Vec::new() }, (5, 1))
+                        self.trial(current, &Ranked { addition: stop, gain: 0.0, start, also: Vec::new() }, (5, 1))
                     {
                         current.steps += trial.spent;
                         if trial.gain > STOP_GAIN {
-                            self.take(&mut current, &trial);
+                            self.take(current, &trial);
                         }
                     }
                 }
             }
         }
-        Ok(current)
     }
 
     /// Adds what the windows call for, until nothing gains enough.
@@ -375,10 +381,11 @@ impl Selector<'_> {
                 // A right effect can gain nothing until its partner is in.
                 match self.pair(&current, best, friction_declared, least)? {
                     Some(pair) => {
-                        let Some(after) = self.holding(&pair, &held_out, &mut current.steps) else { break };
+                        let Some(after) = self.holding(&pair, &held_out, &current.additions, &mut current.steps) else { break };
                         held_out = after;
                         current = Selection { steps: current.steps, ..pair };
                         self.settle(&mut current)?;
+                        self.add_stops(&mut current);
                         current.note_step();
                     }
                     None => break,
@@ -391,7 +398,7 @@ impl Selector<'_> {
             for trial in std::iter::once(best).chain(others).take(HELD_OUT_TRIES) {
                 let mut next = current.clone();
                 self.take(&mut next, trial);
-                if let Some(after) = self.holding(&next, &held_out, &mut current.steps) {
+                if let Some(after) = self.holding(&next, &held_out, &current.additions, &mut current.steps) {
                     taken = Some((trial, next, after));
                     break;
                 }
@@ -412,6 +419,7 @@ impl Selector<'_> {
             current.rivals.extend(best.also.iter().map(|other| (*other, vec![(None, -best.gain)])));
             current.rivals.insert(addition, rivals);
             self.settle(&mut current)?;
+            self.add_stops(&mut current);
             self.drop_what_is_not_needed(&mut current, addition)?;
             current.note_step();
             richer = whole;
@@ -419,13 +427,29 @@ impl Selector<'_> {
         Ok(current)
     }
 
-    /// What windows left out lack by a model; none where it does not hold there against the one before it.
-    fn holding(&self, next: &Selection, before: &HeldOut, steps: &mut usize) -> Option<HeldOut> {
+    /// What windows left out lack by a model; none where it does not hold there against the one before it, with
+    /// the additions `had`, as far as the joints go that move with those in which the two differ.
+    fn holding(
+        &self,
+        next: &Selection,
+        before: &HeldOut,
+        had: &BTreeSet<Addition>,
+        steps: &mut usize,
+    ) -> Option<HeldOut> {
         let after = HeldOut::of(self.workshop, self.batch, next).ok()?;
         *steps += after.steps;
-        let ratios = after.ratios_to(before);
-        tracing::debug!(additions = ?next.additions, ?ratios, "left out");
-        after.holds_against(before).then_some(after)
+        let joints = self.concerned(had.symmetric_difference(&next.additions));
+        let ratios = after.ratios_to(before, &joints);
+        tracing::debug!(additions = ?next.additions, ?ratios, kappa = ?next.noise_scales_of(None), "left out");
+        after.holds_against(before, &joints).then_some(after)
+    }
+
+    /// The joints that move in the windows that additions concern.
+    fn concerned<'b>(&self, additions: impl Iterator<Item = &'b Addition>) -> Vec<usize> {
+        let mut parts = components(self.batch, false);
+        let joints: Vec<Option<usize>> = additions.map(|addition| addition.joint()).collect();
+        parts.retain(|part| joints.iter().any(|joint| joint.is_none_or(|joint| part.joints.contains(&joint))));
+        parts.into_iter().flat_map(|part| part.joints).collect()
     }
 
     /// The model with the best candidate and the best partner of it, if the two gain enough.
@@ -876,6 +900,54 @@ impl Selector<'_> {
         gains.collect()
     }
 
+    /// A model without its additions to some joints, or to the sensor, which are as in the `base` again.
+    pub fn restored(
+        &self,
+        mut selected: Selection,
+        base: &Selection,
+        joints: &[usize],
+        sensor: bool,
+    ) -> Result<Selection, Failure> {
+        let goes = |a: &Addition| a.joint().map_or(sensor, |joint| joints.contains(&joint));
+        let together = selected.additions.iter().any(|a| a.joint().is_none());
+        let without = |additions: &BTreeSet<Addition>| -> BTreeSet<Addition> {
+            let kept = additions.iter().filter(|a| !goes(a));
+            kept.chain(base.additions.iter().filter(|a| goes(a))).copied().collect()
+        };
+        selected.additions = without(&selected.additions);
+        selected.rivals.retain(|addition, _| !goes(addition));
+        selected.declined.retain(|(addition, _)| !goes(addition));
+        for step in &mut selected.stages {
+            step.additions = without(&step.additions);
+        }
+        let bare: BTreeSet<Addition> = base.additions.clone();
+        selected.stages.dedup_by(|a, b| a.additions == b.additions);
+        selected.stages.retain(|step| step.additions != bare);
+        for &joint in joints {
+            if let (Some(own), Some(other)) = (selected.numbers.joints.get_mut(joint), base.numbers.joints.get(joint)) {
+                own.clone_from(other);
+            }
+        }
+        let of_base = base.numbers.added.iter().filter(|(a, _)| base.additions.contains(a) && goes(a));
+        selected.numbers.added.extend(of_base.map(|(addition, own)| (*addition, own.clone())));
+        if together {
+            let fitted = self.fitted(&selected.additions, &selected.numbers, REFIT)?;
+            let Selection { rivals, stages, declined, leftover, steps, .. } = selected;
+            return Ok(Selection { rivals, stages, declined, leftover, steps: steps + fitted.steps, ..fitted });
+        }
+        for component in &mut selected.components {
+            let other = base.components.iter().find(|other| other.joints == component.joints);
+            let Some(other) = other.filter(|_| component.joints.iter().any(|joint| joints.contains(joint))) else {
+                continue;
+            };
+            let evidence = |component: &Component| component.fitted.as_ref().map_or(0.0, |fit| fit.log_evidence);
+            selected.log_evidence += evidence(other) - evidence(component);
+            component.fitted.clone_from(&other.fitted);
+        }
+        self.lay_out(&mut selected);
+        Ok(selected)
+    }
+
     /// The model before the last addition, fitted anew; none where what was added took the place of something.
     pub fn before_last(&self, selected: &Selection) -> Option<Selection> {
         let [earlier @ .., before, _] = &selected.stages[..] else { return None };
@@ -934,7 +1006,7 @@ impl Selector<'_> {
             let trial = self.trial(&current, &Ranked { addition, gain, start: Vec::new(), also: Vec::new() }, REFIT)?;
             let mut next = current.clone();
             self.take(&mut next, &trial);
-            let Some(after) = self.holding(&next, &held_out, &mut current.steps) else { continue };
+            let Some(after) = self.holding(&next, &held_out, &current.additions, &mut current.steps) else { continue };
             held_out = after;
             current = Selection { steps: current.steps, ..next };
             current.rivals.insert(addition, vec![(None, -trial.gain)]);
