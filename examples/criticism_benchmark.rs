@@ -1,6 +1,6 @@
 //! How often criticism names the right effect, raises false alarms, and owns to not knowing.
 //!
-//! `cargo run --release --example criticism_benchmark [OBJECTS [PLAIN]]`, each a count or a range such as `2..4`,
+//! `cargo run --release --example criticism_benchmark [OBJECTS [PLAIN [EFFECT]]]`, the numbers each a count or a range such as `2..4`,
 //! writes a line for each object to standard error, and tables at the end; `--sum LOG...` makes the tables of such
 //! lines. The tables are in `docs/criticism.md`.
 #![allow(clippy::print_stdout, clippy::print_stderr, reason = "the tables are what this program is for")]
@@ -16,7 +16,7 @@ use bayesian_object_models::types::posterior::{Criticism, Verdict};
 use rayon::prelude::*;
 use world::{EFFECTS, Record, SIZES, UNLISTED, Undeclared, object};
 
-/// Interactions with one joint; of two joints twice as many.
+/// Interactions with the joint that has the effect; where there is another they take turns.
 const WINDOWS: usize = 5;
 
 struct Run {
@@ -28,6 +28,8 @@ struct Run {
 }
 
 fn main() {
+    let filter = tracing_subscriber::EnvFilter::from_default_env();
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(false).init();
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let mut runs = match &arguments[..] {
         [flag, logs @ ..] if flag == "--sum" => logs.iter().flat_map(|log| logged(log)).collect(),
@@ -51,12 +53,13 @@ fn run(arguments: &[String]) -> Vec<Run> {
         Some(Err(count)) => 0..count.parse().expect("a number"),
     };
     let (objects, plain) = (range(0, 8), range(1, 60));
+    let asked = |name: &str| arguments.get(2).is_none_or(|only| only == name);
     let per_number = (plain.end - plain.start).div_ceil((objects.end - objects.start).max(1)).max(1);
     let mut plain = plain.peekable();
     let mut tasks: Vec<(&'static str, usize, u64)> = Vec::new();
     for number in objects {
         tasks.extend(plain.by_ref().take(per_number as usize).map(|number| ("plain", 2, number)));
-        for name in EFFECTS.into_iter().chain(UNLISTED) {
+        for name in EFFECTS.into_iter().chain(UNLISTED).filter(|name| asked(name)) {
             tasks.extend((0..SIZES.len()).map(|size| (name, size, number)));
         }
     }
@@ -66,7 +69,7 @@ fn run(arguments: &[String]) -> Vec<Run> {
         .map(|&(name, size, number)| {
             let (object, mut rng) = object(name, SIZES[size], number);
             let twice = matches!(object.undeclared, Some(Undeclared::Brake(_)));
-            let record = Record::of(&object, if twice { 2 * WINDOWS } else { WINDOWS }, &mut rng);
+            let record = Record::of(&object, if twice { 2 * WINDOWS - 1 } else { WINDOWS }, &mut rng);
             let findings = record.criticize(&DeclaredPhysics::default()).1.findings();
             let line = serde_json::json!({ "name": name, "size": size, "number": number, "findings": findings });
             eprintln!("{line}");

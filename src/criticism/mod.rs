@@ -96,9 +96,9 @@ impl Critic {
         let (selected, findings, scales, seed) = {
             let workshop =
                 Workshop { learner, fit, input, rest_prior: rest_prior.clone(), sensor_scales: SENSOR_SCALES, spans };
-            let found =
-                self.stages.last().filter(|_| known_joints).map(|step| step.additions.clone()).unwrap_or_default();
-            let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref(), found: &found };
+            let found = self.stages.last().map(|step| step.additions.clone()).unwrap_or_default();
+            let found = Some(&found).filter(|_| known_joints);
+            let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref(), found };
             let base = selector.base(&numbers)?;
             tracing::debug!(evidence = base.log_evidence, additions = ?base.additions, kappa = ?noise_scales(&base, &batch), "base");
             let before = scores(&workshop, &batch, &base).unwrap_or_default();
@@ -206,8 +206,7 @@ impl Critic {
         let numbers = known.unwrap_or_else(|| Numbers { joints, sensor, added: BTreeMap::new() });
         let workshop =
             Workshop { learner, fit, input, rest_prior, sensor_scales: SENSOR_SCALES, spans: spans_of(input) };
-        let found = BTreeSet::new();
-        let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref(), found: &found };
+        let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref(), found: None };
         let mut selections = vec![selector.base(&numbers)?];
         for step in &self.stages {
             // From where it was found and from where all ended.

@@ -164,8 +164,9 @@ pub struct Selector<'a> {
     pub batch: &'a [BatchWindow],
     /// What the sensor read at rest.
     pub rest: Option<&'a RestReadings>,
-    /// What the last review found: joints that the newest window does not concern are only asked for it.
-    pub found: &'a BTreeSet<Addition>,
+    /// What the last review found: joints that the newest window does not concern are only asked for it. None
+    /// where there was no review of these joints: all are asked.
+    pub found: Option<&'a BTreeSet<Addition>>,
 }
 
 /// A refitted candidate.
@@ -620,8 +621,8 @@ impl Selector<'_> {
                 .copied()
                 .filter(|joint| windows.iter().any(|w| w.moving.contains(joint)))
                 .collect();
-            let concerned = windows.iter().any(|w| Some(w.index) == newest);
-            let known = self.found.iter().filter(|a| a.joint().is_none_or(|joint| moved.contains(&joint)));
+            let concerned = self.found.is_none() || windows.iter().any(|w| Some(w.index) == newest);
+            let known = self.found.into_iter().flatten().filter(|a| a.joint().is_none_or(|joint| moved.contains(&joint)));
             // A table may stand for anything: it describes what is left where nothing with a name does.
             let named = |a: &&Addition| !matches!(a, Addition::Stop(..) | Addition::Table(..));
             let known = known.filter(|a| !current.additions.contains(a)).filter(named);

@@ -122,6 +122,8 @@ pub struct WindowCutter {
     frames: VecDeque<Frame>,
     open_since: Option<f64>,
     last_contact_s: f64,
+    /// The part nearest to the tool then, as far as clouds show.
+    last_touched: Option<Label>,
 }
 
 impl WindowCutter {
@@ -132,6 +134,7 @@ impl WindowCutter {
             frames: VecDeque::new(),
             open_since: None,
             last_contact_s: f64::NEG_INFINITY,
+            last_touched: None,
         }
     }
 
@@ -166,11 +169,14 @@ impl WindowCutter {
                 previous + (now - previous) * f64::from(i) / f64::from(steps) - 0.5 * self.readings.settings.smoothing_s
             })
             .any(|t| self.readings.active_at(t, None));
-        // What is let go may move on by itself while the tool goes to the next part: two contacts, two windows.
-        let anew = active && self.is_open() && now - self.last_contact_s > self.readings.settings.quiet_s;
-        let let_go = anew.then(|| self.close(previous));
+        // What is let go may move on by itself while the tool goes to another part: two contacts, two windows.
+        let touched = if active { self.readings.touched(&frame) } else { None };
+        let another = touched.is_some() && self.last_touched.is_some() && touched != self.last_touched;
+        let silent = now - self.last_contact_s > self.readings.settings.quiet_s;
+        let let_go = (another && silent && self.is_open()).then(|| self.close(previous));
         if active {
             self.last_contact_s = now;
+            self.last_touched = touched;
         }
         // Registration sees motion where there is none; a measured pose does not.
         let opens = active || frame.moves;
@@ -325,6 +331,16 @@ impl Readings {
         })
     }
 
+    /// The part whose points are nearest to the tool.
+    fn touched(&self, frame: &Frame) -> Option<Label> {
+        let tool = self.wrenches.iter().rev().find(|w| w.tool && self.time(w) <= frame.time_s)?.point_in_world;
+        let distance = |scan: &Vec<ScanPoint>| {
+            scan.iter().map(|point| (point.point_in_world - tool).norm_squared()).min_by(f64::total_cmp)
+        };
+        let distances = frame.scans.iter().filter_map(|(label, scan)| Some((*label, distance(scan)?)));
+        distances.min_by(|a, b| a.1.total_cmp(&b.1)).map(|(label, _)| label)
+    }
+
     /// Whether the noise of every tool's readings is known.
     fn is_settled(&self) -> bool {
         let known = |wrench: &AppliedWrench| self.rest.get(&wrench.source).is_some_and(RestReading::is_settled);
@@ -446,7 +462,12 @@ mod tests {
             });
             if k % 10 == 0 {
                 // What was let go at 2 s has not come to rest by the next contact.
-                let frame = Frame { time_s, ..Frame::default() };
+                let at = |x: f64| {
+                    let point = Vector3::new(x, 0.1, 0.0);
+                    vec![ScanPoint { point_in_world: point, viewpoint_in_world: None }]
+                };
+                let scans = BTreeMap::from([(Label(1), at(0.0)), (Label(2), at(1.0))]);
+                let frame = Frame { time_s, scans: scans.into(), ..Frame::default() };
                 windows.extend(cutter.push_frame(frame, time_s > 1.0));
             }
         }
