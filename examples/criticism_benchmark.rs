@@ -1,8 +1,8 @@
 //! How often criticism names the right effect, raises false alarms, and owns to not knowing.
 //!
-//! `cargo run --release --example criticism_benchmark [OBJECTS [PLAIN [EFFECT]]]`, the numbers each a count or a range such as `2..4`,
-//! writes a line for each object to standard error, and tables at the end; `--sum LOG...` makes the tables of such
-//! lines. The tables are in `docs/criticism.md`.
+//! `cargo run --release --example criticism_benchmark [OBJECTS [PLAIN [EFFECT]]]`, the numbers each a count or a
+//! range such as `2..4`, writes a line for each object to standard error, and tables at the end; `--sum LOG...`
+//! makes the tables of such lines. The tables are in `docs/criticism.md`.
 #![allow(clippy::print_stdout, clippy::print_stderr, reason = "the tables are what this program is for")]
 #![allow(clippy::expect_used, reason = "a program for the command line")]
 

@@ -190,6 +190,12 @@ impl Trial {
         median(windows.map(|window| window.reduction).collect()).unwrap_or(1.0)
     }
 
+    /// κ of the usual window.
+    fn usual_noise_scale(&self) -> f64 {
+        let windows = self.fits.iter().flat_map(|(_, fitted)| &fitted.windows);
+        median(windows.map(|window| window.noise_scale).collect()).unwrap_or(1.0)
+    }
+
     /// How many numbers it adds.
     fn numbers(&self) -> usize {
         let of = |addition: &Addition| match *addition {
@@ -366,6 +372,8 @@ impl Selector<'_> {
             current.declined = trials.iter().map(|trial| (trial.addition, trial.gain)).collect();
             let least = LEAST_GAIN + candidates.ln();
             let needs = |trial: &Trial| match trial.addition {
+                // It acts in one window: where others are not explained either, something acts in them all.
+                Addition::Effect(_, EffectKind::Impulse) if trial.usual_noise_scale() >= MISFIT => f64::INFINITY,
                 Addition::Effect(_, EffectKind::Impulse) => least + PLACES.ln(),
                 _ => least,
             };
