@@ -14,8 +14,8 @@ mod signature;
 mod statistics;
 
 pub use numbers::{Addition, Numbers, Workshop};
-pub use selection::{Component, Selection, Selector, Step};
 use selection::components;
+pub use selection::{Component, Selection, Selector, Step};
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -135,9 +135,10 @@ impl Critic {
             }
             let seed = (selected.numbers.clone(), selected.stages.clone());
             // What no window tells but those that it was learned of is a guess, kept to start from.
-            let unscored = joints_of(parts_with(batch, &selected).filter(|part| {
-                part.windows.iter().all(|w| !before.densities.contains_key(w))
-            }));
+            let unscored = joints_of(
+                parts_with(batch, &selected)
+                    .filter(|part| part.windows.iter().all(|w| !before.densities.contains_key(w))),
+            );
             if !unscored.is_empty() {
                 selected = selector.restored(selected, &base, &unscored, false)?;
             }

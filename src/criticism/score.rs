@@ -61,8 +61,7 @@ pub fn scores(workshop: &Workshop<'_>, batch: &[BatchWindow], selection: &Select
             Err(failure) => tracing::debug!(joints = ?component.joints, %failure, "not scored"),
         }
     }
-    let mut scores =
-        Scores { rows: Vec::new(), densities: scored.iter().map(|s| (s.window, s.log_density)).collect() };
+    let mut scores = Scores { rows: Vec::new(), densities: scored.iter().map(|s| (s.window, s.log_density)).collect() };
     let mut by_joint: BTreeMap<usize, Vec<(usize, &Scored)>> = BTreeMap::new();
     for one in &scored {
         for (column, joint) in batch[one.window].moving.iter().enumerate() {

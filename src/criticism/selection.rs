@@ -371,11 +371,14 @@ impl Selector<'_> {
             }
             current.declined = trials.iter().map(|trial| (trial.addition, trial.gain)).collect();
             let least = LEAST_GAIN + candidates.ln();
+            let needs_of = |addition: Addition| match addition {
+                Addition::Effect(_, EffectKind::Impulse) => least + PLACES.ln(),
+                _ => least,
+            };
             let needs = |trial: &Trial| match trial.addition {
                 // It acts in one window: where others are not explained either, something acts in them all.
                 Addition::Effect(_, EffectKind::Impulse) if trial.usual_noise_scale() >= MISFIT => f64::INFINITY,
-                Addition::Effect(_, EffectKind::Impulse) => least + PLACES.ln(),
-                _ => least,
+                addition => needs_of(addition),
             };
             let Some(best) = trials.iter().find(|trial| trial.gain > needs(trial)).or(trials.first()) else { break };
             let part_of_it =
@@ -390,7 +393,9 @@ impl Selector<'_> {
                 // A right effect can gain nothing until its partner is in.
                 match self.pair(&current, best, friction_declared, least)? {
                     Some(pair) => {
-                        let Some(after) = self.holding(&pair, &held_out, &current.additions, &mut current.steps) else { break };
+                        let Some(after) = self.holding(&pair, &held_out, &current.additions, &mut current.steps) else {
+                            break;
+                        };
                         held_out = after;
                         current = Selection { steps: current.steps, ..pair };
                         self.settle(&mut current)?;
@@ -423,12 +428,20 @@ impl Selector<'_> {
                 .collect();
             rivals.push((None, -best.gain));
             let addition = best.addition;
+            let had = current.clone();
             current =
                 Selection { steps: current.steps, declined: current.declined, leftover: current.leftover, ..next };
             current.rivals.extend(best.also.iter().map(|other| (*other, vec![(None, -best.gain)])));
             current.rivals.insert(addition, rivals);
             self.settle(&mut current)?;
             self.add_stops(&mut current);
+            // What gained by leading to a better optimum of the model before it is not needed itself.
+            if let Some(without) = self.as_good_without(&current, &had, needs_of(addition))? {
+                tracing::debug!(?addition, evidence = without.log_evidence, "a better optimum without");
+                held_out = HeldOut::of(self.workshop, self.batch, &without).unwrap_or_default();
+                current = Selection { rivals: had.rivals, stages: had.stages, ..without };
+                continue;
+            }
             self.drop_what_is_not_needed(&mut current, addition)?;
             current.note_step();
             richer = whole;
@@ -630,7 +643,8 @@ impl Selector<'_> {
                 .filter(|joint| windows.iter().any(|w| w.moving.contains(joint)))
                 .collect();
             let concerned = self.found.is_none() || windows.iter().any(|w| Some(w.index) == newest);
-            let known = self.found.into_iter().flatten().filter(|a| a.joint().is_none_or(|joint| moved.contains(&joint)));
+            let known =
+                self.found.into_iter().flatten().filter(|a| a.joint().is_none_or(|joint| moved.contains(&joint)));
             // A table may stand for anything: it describes what is left where nothing with a name does.
             let named = |a: &&Addition| !matches!(a, Addition::Stop(..) | Addition::Table(..));
             let known = known.filter(|a| !current.additions.contains(a)).filter(named);
@@ -855,6 +869,26 @@ impl Selector<'_> {
                 fitted.active = active;
             }
         }
+    }
+
+    /// The model `had` before the newest addition, fitted anew from where that led, if it does as well but for
+    /// this much evidence.
+    fn as_good_without(&self, current: &Selection, had: &Selection, least: f64) -> Result<Option<Selection>, Failure> {
+        let stops = current.additions.iter().filter(|a| matches!(a, Addition::Stop(..)));
+        let additions: BTreeSet<Addition> = had.additions.iter().chain(stops).copied().collect();
+        let mut numbers = current.numbers.clone();
+        // What the newest took the place of is as it was.
+        numbers.added.extend(
+            had.numbers.added.iter().filter(|(a, _)| !current.additions.contains(a)).map(|(a, own)| (*a, own.clone())),
+        );
+        let mut without = self.fitted(&additions, &numbers, REFIT)?;
+        without.steps += current.steps;
+        let same = (without.log_evidence > current.log_evidence - least).then_some(without);
+        Ok(same.map(|without| Selection {
+            declined: current.declined.clone(),
+            leftover: current.leftover.clone(),
+            ..without
+        }))
     }
 
     /// After a right effect is in, one that stood in for it may go.
