@@ -22,6 +22,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::{Deserialize, Serialize};
 
 use crate::inference::Failure;
+use crate::mechanism::effects::TableKind;
 use crate::model::{BatchWindow, DynamicsInput, DynamicsLearner, Hypothesis, KinematicFit};
 use crate::types::Label;
 use crate::types::posterior::{Criticism, Verdict};
@@ -128,7 +129,8 @@ impl Critic {
             let all: Vec<usize> = (0..batch.len()).collect();
             while let Some(fewer) = selector.before_last(&selected).filter(|_| !after.densities.is_empty())
                 && let Ok(found) = scores(&workshop, batch, &fewer)
-                && found.better_on(&all, &after) == Some(true)
+                && (found.better_on(&all, &after) == Some(true)
+                    || (only_timed(&selected, &fewer) && found.simulates_better_than(&after)))
             {
                 tracing::debug!(additions = ?selected.additions, "predicts no better than the model before it");
                 (selected, after) = (fewer, found);
@@ -297,6 +299,12 @@ fn joints_of(parts: impl Iterator<Item = Component>) -> Vec<usize> {
 fn parts_with(batch: &[BatchWindow], selected: &Selection) -> impl Iterator<Item = Component> {
     let joints: BTreeSet<usize> = selected.rivals.keys().filter_map(|addition| addition.joint()).collect();
     components(batch, false).into_iter().filter(move |part| part.joints.iter().any(|joint| joints.contains(joint)))
+}
+
+/// Whether all that a model has more than another is a force over time, which says nothing of other windows.
+fn only_timed(selected: &Selection, fewer: &Selection) -> bool {
+    let mut more = selected.additions.difference(&fewer.additions);
+    more.all(|addition| matches!(addition, Addition::Table(_, TableKind::ForceOverTime)))
 }
 
 /// The selected model and its scores, without what the windows that it concerns do not bear out, joints that

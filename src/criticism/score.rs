@@ -34,6 +34,16 @@ impl Scores {
         self.densities.values().sum()
     }
 
+    /// Whether force and position together are simulated better, over all parts.
+    pub fn simulates_better_than(&self, other: &Self) -> bool {
+        let lack = |row: &ResidualScore| {
+            let force = row.force_rmse_n.or(row.torque_rmse_nm).unwrap_or(0.0).max(1e-30);
+            force.ln() + (row.position_rmse_m.hypot(row.rotation_rmse_rad)).max(1e-30).ln()
+        };
+        let sum = |scores: &Self| scores.rows.iter().map(lack).sum::<f64>();
+        self.rows.len() == other.rows.len() && sum(self) < sum(other)
+    }
+
     /// Whether some windows, those that could be scored `before`, are predicted better than there; none where
     /// none could be.
     pub fn better_on(&self, windows: &[usize], before: &Self) -> Option<bool> {
