@@ -1,7 +1,8 @@
 //! How often criticism names the right effect, raises false alarms, and owns to not knowing.
 //!
-//! `cargo run --release --example criticism_benchmark [OBJECTS [PLAIN]]`; the tables are in
-//! `docs/criticism.md`.
+//! `cargo run --release --example criticism_benchmark [OBJECTS [PLAIN [EFFECT]]]`, the numbers each a count or a
+//! range such as `2..4`, writes a line for each object to standard error, and tables at the end; `--sum LOG...`
+//! makes the tables of such lines. The tables are in `docs/criticism.md`.
 #![allow(clippy::print_stdout, clippy::print_stderr, reason = "the tables are what this program is for")]
 #![allow(clippy::expect_used, reason = "a program for the command line")]
 
@@ -15,42 +16,80 @@ use bayesian_object_models::types::posterior::{Criticism, Verdict};
 use rayon::prelude::*;
 use world::{EFFECTS, Record, SIZES, UNLISTED, Undeclared, object};
 
-/// Interactions with one joint; of two joints twice as many.
+/// Interactions with the joint that has the effect; where there is another they take turns.
 const WINDOWS: usize = 5;
 
 struct Run {
     name: &'static str,
     size: usize,
+    number: u64,
     findings: Criticism,
     undeclared: Option<Undeclared>,
 }
 
 fn main() {
-    let argument = |i: usize| std::env::args().nth(i).map(|text| text.parse::<u64>().expect("a number"));
-    let objects = argument(1).unwrap_or(8);
-    let plain = argument(2).unwrap_or(60);
-    let mut tasks: Vec<(&'static str, usize, u64)> = (0..plain).map(|number| ("plain", 2, number)).collect();
-    for number in 0..objects {
-        for name in EFFECTS.into_iter().chain(UNLISTED) {
-            tasks.extend((0..SIZES.len()).map(|size| (name, size, number)));
-        }
-    }
-    let runs: Vec<Run> = tasks
-        .par_iter()
-        .map(|&(name, size, number)| {
-            let (object, mut rng) = object(name, SIZES[size], number);
-            let twice = matches!(object.undeclared, Some(Undeclared::Brake(_)));
-            let record = Record::of(&object, if twice { 2 * WINDOWS } else { WINDOWS }, &mut rng);
-            let findings = record.criticize(&DeclaredPhysics::default()).1.findings();
-            let found: Vec<&str> = findings.effects.iter().map(|effect| effect.name.as_str()).collect();
-            eprintln!("{name} {} {number}: {:?} {found:?}", SIZES[size], findings.verdict);
-            Run { name, size, findings, undeclared: object.undeclared }
-        })
-        .collect();
+    let filter = tracing_subscriber::EnvFilter::from_default_env();
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(false).init();
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let mut runs = match &arguments[..] {
+        [flag, logs @ ..] if flag == "--sum" => logs.iter().flat_map(|log| logged(log)).collect(),
+        _ => run(&arguments),
+    };
+    // A run that was stopped and begun anew may have some twice.
+    runs.sort_by_key(|run| (run.name, run.size, run.number));
+    runs.dedup_by_key(|run| (run.name, run.size, run.number));
+    println!("{} objects.\n", runs.len());
     print_recognition(&runs);
     print_plain(&runs);
     print_confusion(&runs);
     print_coverage(&runs);
+}
+
+/// Runs what the arguments ask for, in the order of the objects' numbers, and logs each as it ends.
+fn run(arguments: &[String]) -> Vec<Run> {
+    let range = |i: usize, otherwise: u64| match arguments.get(i).map(|text| text.split_once("..").ok_or(text)) {
+        None => 0..otherwise,
+        Some(Ok((from, to))) => from.parse().expect("a number")..to.parse().expect("a number"),
+        Some(Err(count)) => 0..count.parse().expect("a number"),
+    };
+    let (objects, plain) = (range(0, 8), range(1, 60));
+    let asked = |name: &str| arguments.get(2).is_none_or(|only| only == name);
+    let per_number = (plain.end - plain.start).div_ceil((objects.end - objects.start).max(1)).max(1);
+    let mut plain = plain.peekable();
+    let mut tasks: Vec<(&'static str, usize, u64)> = Vec::new();
+    for number in objects {
+        tasks.extend(plain.by_ref().take(per_number as usize).map(|number| ("plain", 2, number)));
+        for name in EFFECTS.into_iter().chain(UNLISTED).filter(|name| asked(name)) {
+            tasks.extend((0..SIZES.len()).map(|size| (name, size, number)));
+        }
+    }
+    tasks.extend(plain.map(|number| ("plain", 2, number)));
+    tasks
+        .par_iter()
+        .map(|&(name, size, number)| {
+            let (object, mut rng) = object(name, SIZES[size], number);
+            let twice = matches!(object.undeclared, Some(Undeclared::Brake(_)));
+            let record = Record::of(&object, if twice { 2 * WINDOWS - 1 } else { WINDOWS }, &mut rng);
+            let findings = record.criticize(&DeclaredPhysics::default()).1.findings();
+            let line = serde_json::json!({ "name": name, "size": size, "number": number, "findings": findings });
+            eprintln!("{line}");
+            Run { name, size, number, findings, undeclared: object.undeclared }
+        })
+        .collect()
+}
+
+/// The runs in a log.
+fn logged(path: &str) -> Vec<Run> {
+    let text = std::fs::read_to_string(path).expect("a log");
+    let lines = text.lines().filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok());
+    let runs = lines.filter_map(|line| {
+        let name = ["plain"].into_iter().chain(EFFECTS).chain(UNLISTED).find(|name| line["name"] == **name)?;
+        let size = SIZES.iter().enumerate().position(|(size, _)| line["size"] == size)?;
+        let number = line["number"].as_u64()?;
+        let findings = serde_json::from_value(line["findings"].clone()).ok()?;
+        Some(Run { name, size, number, findings, undeclared: object(name, SIZES[size], number).0.undeclared })
+    });
+    runs.collect()
 }
 
 /// What was named first; a class counts by any of its members.

@@ -89,10 +89,11 @@ impl HeldOut {
     }
 
     /// ln(force · position) in units of what another model leaves, of all windows and of the usual one, means of
-    /// the joints; none where nothing could be left out.
-    pub fn ratios_to(&self, before: &Self) -> Option<[f64; 2]> {
+    /// the `joints` that the difference concerns, so that the others do not stand up for it; none where nothing
+    /// could be left out.
+    pub fn ratios_to(&self, before: &Self, joints: &[usize]) -> Option<[f64; 2]> {
         let mut ratios = Vec::new();
-        for (joint, own) in &self.lacks {
+        for (joint, own) in self.lacks.iter().filter(|(joint, _)| joints.contains(joint)) {
             let others = before.lacks.get(joint);
             let pairs: Vec<(Lack, Lack)> =
                 own.iter().filter_map(|(window, lack)| Some((*lack, *others?.get(window)?))).collect();
@@ -110,9 +111,9 @@ impl HeldOut {
         (!ratios.is_empty()).then(|| [mean(0), mean(1)])
     }
 
-    /// Whether windows left out are simulated no worse than by another model.
-    pub fn holds_against(&self, before: &Self) -> bool {
-        self.ratios_to(before).is_none_or(|[all, usual]| 0.5 * (all + usual) < SLACK)
+    /// Whether windows left out are simulated no worse than by another model, as far as these joints go.
+    pub fn holds_against(&self, before: &Self, joints: &[usize]) -> bool {
+        self.ratios_to(before, joints).is_none_or(|[all, usual]| 0.5 * (all + usual) < SLACK)
     }
 }
 
@@ -121,5 +122,41 @@ impl Lack {
     fn ln_over(&self, other: &Self) -> f64 {
         let log = |own: f64, other: f64| 0.5 * (own.max(1e-30) / other.max(1e-30)).ln();
         log(self.force, other.force) + log(self.position, other.position)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Lacks of force and position by joint, one for each window.
+    fn held_out(of_joints: &[(usize, &[f64])]) -> HeldOut {
+        let windows = |own: &[f64]| {
+            own.iter().map(|lack| Lack { force: lack * lack, position: lack * lack }).enumerate().collect()
+        };
+        HeldOut { lacks: of_joints.iter().map(|(joint, own)| (*joint, windows(own))).collect(), steps: 0 }
+    }
+
+    #[test]
+    fn one_joint_does_not_stand_up_for_another() {
+        let before = held_out(&[(0, &[1.0; 4]), (1, &[1.0; 4])]);
+        let after = held_out(&[(0, &[0.2; 4]), (1, &[1.1; 4])]);
+        assert!(after.holds_against(&before, &[0, 1]), "a sensor's error concerns both");
+        assert!(after.holds_against(&before, &[0]));
+        assert!(!after.holds_against(&before, &[1]));
+    }
+
+    #[test]
+    fn what_helps_one_window_and_harms_the_others_does_not_hold() {
+        let before = held_out(&[(0, &[1.0, 1.0, 1.0, 1.0])]);
+        assert!(!held_out(&[(0, &[0.9, 1.15, 1.15, 1.15])]).holds_against(&before, &[0]));
+        assert!(held_out(&[(0, &[0.5, 1.01, 1.01, 1.01])]).holds_against(&before, &[0]));
+    }
+
+    #[test]
+    fn nothing_left_out_says_nothing() {
+        let none = HeldOut::default();
+        assert_eq!(none.ratios_to(&held_out(&[(0, &[1.0])]), &[0]), None);
+        assert!(none.holds_against(&HeldOut::default(), &[0]));
     }
 }

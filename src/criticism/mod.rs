@@ -14,6 +14,7 @@ mod signature;
 mod statistics;
 
 pub use numbers::{Addition, Numbers, Workshop};
+use selection::components;
 pub use selection::{Component, Selection, Selector, Step};
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -22,6 +23,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::inference::Failure;
 use crate::mechanism::JointType;
+use crate::mechanism::effects::TableKind;
 use crate::model::{BatchWindow, DynamicsInput, DynamicsLearner, Hypothesis, KinematicFit};
 use crate::types::Label;
 use crate::types::posterior::{Criticism, Verdict};
@@ -98,6 +100,7 @@ impl Critic {
         if reviewed == self.reviewed {
             return Ok(0);
         }
+        self.reviewed = reviewed;
         let rest = RestReadings::of(&batch, input, &SENSOR_SCALES);
         let spans = spans_of(input);
         let rest_prior = rest.as_ref().and_then(RestReadings::posterior);
@@ -107,18 +110,18 @@ impl Critic {
         let known_joints = known.is_some();
         let added = known.map_or_else(BTreeMap::new, |(_, numbers)| numbers.added.clone());
         let numbers = Numbers { joints, sensor, added };
-        let (selected, findings, scales) = {
+        let (selected, findings, scales, seed) = {
             let workshop =
                 Workshop { learner, fit, input, rest_prior: rest_prior.clone(), sensor_scales: SENSOR_SCALES, spans };
-            let found =
-                self.stages.last().filter(|_| known_joints).map(|step| step.additions.clone()).unwrap_or_default();
-            let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref(), found: &found };
+            let found = self.stages.last().map(|step| step.additions.clone()).unwrap_or_default();
+            let found = Some(&found).filter(|_| known_joints);
+            let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref(), found };
             let base = selector.base(&numbers)?;
             tracing::debug!(evidence = base.log_evidence, additions = ?base.additions, kappa = ?noise_scales(&base, &batch), "base");
             let before = scores(&workshop, &batch, &base).unwrap_or_default();
             let selected = selector.select(base.clone())?;
             // A window that no hypothesis comes near, while the others are explained, is none of the physics'.
-            let outlying = outlying(&selected);
+            let outlying = outlying(&selected, &batch);
             let rest_of_batch: Vec<BatchWindow> = batch
                 .iter()
                 .enumerate()
@@ -136,32 +139,29 @@ impl Critic {
                 let before = scores(&workshop, batch, &base).unwrap_or_default();
                 (base.clone(), before, selector.select(base)?)
             };
-            let mut selected = selector.describe_leftover(selected)?;
-            // What explains most windows no better than noise would says nothing of what they lack.
-            let scales = noise_scales(&selected, batch).into_iter().map(|(_, scale)| scale).collect();
-            if crate::math::median(scales).is_some_and(|scale| scale >= OUTLYING.0) {
-                return Err(Failure::Diverged);
+            let selected = selector.describe_leftover(selected)?;
+            let (mut selected, mut after) = confirmed(&selector, &base, &before, selected)?;
+            // Nor is a last addition there that does not predict better.
+            let all: Vec<usize> = (0..batch.len()).collect();
+            while let Some(fewer) = selector.before_last(&selected).filter(|_| !after.densities.is_empty())
+                && let Ok(found) = scores(&workshop, batch, &fewer)
+                && (found.better_on(&all, &after) == Some(true)
+                    || (only_timed(&selected, &fewer) && found.simulates_better_than(&after)))
+            {
+                tracing::debug!(additions = ?selected.additions, "predicts no better than the model before it");
+                (selected, after) = (fewer, found);
             }
-            let mut after = before.clone();
-            if !selected.rivals.is_empty() {
-                match scores(&workshop, batch, &selected) {
-                    // What does not predict windows not yet learned better is not there.
-                    Ok(found) if found.windows == 0 || found.log_predictive_density > before.log_predictive_density => {
-                        after = found;
-                        // Nor is a last addition there that does not.
-                        while let Some(fewer) = selector.before_last(&selected).filter(|_| after.windows > 0)
-                            && let Ok(found) = scores(&workshop, batch, &fewer)
-                            && found.log_predictive_density > after.log_predictive_density
-                        {
-                            tracing::debug!(additions = ?selected.additions, "predicts no better than the model before it");
-                            (selected, after) = (fewer, found);
-                        }
-                    }
-                    _ => selected = Selection { steps: selected.steps, ..base },
-                }
+            let seed = (selected.numbers.clone(), selected.stages.clone());
+            // What no window tells but those that it was learned of is a guess, kept to start from.
+            let unscored = joints_of(
+                parts_with(batch, &selected)
+                    .filter(|part| part.windows.iter().all(|w| !before.densities.contains_key(w))),
+            );
+            if !unscored.is_empty() {
+                selected = selector.restored(selected, &base, &unscored, false)?;
             }
             tracing::debug!(evidence = selected.log_evidence, steps = selected.steps, additions = ?selected.additions,
-                kappa = ?noise_scales(&selected, batch), before = before.log_predictive_density, after = after.log_predictive_density, "selected");
+                kappa = ?noise_scales(&selected, batch), before = before.log_predictive_density(), after = after.log_predictive_density(), "selected");
             // What weighs most decides: a name beside a stronger unknown explains little.
             let loss = |addition: &Addition| {
                 let rivals = selected.rivals.get(addition)?;
@@ -170,14 +170,14 @@ impl Critic {
             let found = selected.additions.iter().filter_map(|a| Some((loss(a)?, a)));
             let named = found.max_by(|a, b| a.0.total_cmp(&b.0)).is_some_and(|(_, a)| a.name() != "unknown");
             let verdict = match () {
-                () if before.windows < 2 => Verdict::Insufficient,
+                () if before.densities.len() < 2 => Verdict::Insufficient,
                 () if named => Verdict::EffectFound,
                 () if !selected.rivals.is_empty() || leaves_much(&workshop, &selected, &after) => Verdict::Unexplained,
                 () => Verdict::Adequate,
             };
             let findings = Criticism { verdict, effects: Vec::new(), before: before.rows, after: after.rows };
             let scales = noise_scales(&selected, batch);
-            (selected, findings, scales)
+            (selected, findings, scales, seed)
         };
         let found = findings.verdict != Verdict::Insufficient && !selected.rivals.is_empty();
         let mut findings = findings;
@@ -196,11 +196,10 @@ impl Critic {
             }
         }
         let steps = selected.steps;
-        self.known = Some((labels, selected.numbers.clone()));
-        self.stages.clone_from(&selected.stages);
+        self.known = Some((labels, seed.0));
+        self.stages = seed.1;
         self.findings = Some(findings);
         self.selection = Some(selected);
-        self.reviewed = reviewed;
         Ok(steps)
     }
 }
@@ -226,8 +225,7 @@ impl Critic {
         let numbers = known.unwrap_or_else(|| Numbers { joints, sensor, added: BTreeMap::new() });
         let workshop =
             Workshop { learner, fit, input, rest_prior, sensor_scales: SENSOR_SCALES, spans: spans_of(input) };
-        let found = BTreeSet::new();
-        let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref(), found: &found };
+        let selector = Selector { workshop: &workshop, batch: &batch, rest: rest.as_ref(), found: None };
         let mut selections = vec![selector.base(&numbers)?];
         for step in &self.stages {
             // From where it was found and from where all ended.
@@ -282,18 +280,86 @@ fn noise_scales(selection: &Selection, batch: &[BatchWindow]) -> Vec<(usize, f64
 /// κ of a window that a model does not come near, at least and in units of the usual one.
 const OUTLYING: (f64, f64) = (1e4, 30.0);
 
-/// Places in the batch of the windows that the selected model does not come near, where most are explained.
-fn outlying(selection: &Selection) -> Vec<usize> {
-    let mut far = Vec::new();
-    let mut all = 0;
-    let scales = selection.components.iter().filter_map(|c| c.fitted.as_ref()).flat_map(|f| &f.windows);
-    let usual = crate::math::median(scales.map(|window| window.noise_scale).collect()).unwrap_or(1.0);
-    let least = OUTLYING.0.max(OUTLYING.1 * usual);
-    for component in &selection.components {
-        let Some(fitted) = &component.fitted else { continue };
-        all += component.windows.len();
-        let own = component.windows.iter().zip(&fitted.windows);
-        far.extend(own.filter(|(_, window)| window.noise_scale >= least).map(|(w, _)| *w));
+/// Windows of some joints, by place in the batch, with κ.
+fn noise_scales_by_place(selection: &Selection) -> BTreeMap<usize, f64> {
+    let fitted = selection.components.iter().filter_map(|c| Some((&c.windows, c.fitted.as_ref()?)));
+    fitted.flat_map(|(places, fit)| places.iter().copied().zip(fit.windows.iter().map(|w| w.noise_scale))).collect()
+}
+
+/// κ of the usual window of joints that move together.
+fn usual_noise_scale(part: &Component, scales: &BTreeMap<usize, f64>) -> f64 {
+    crate::math::median(part.windows.iter().filter_map(|w| scales.get(w).copied()).collect()).unwrap_or(1.0)
+}
+
+/// Places in the batch of the windows that the selected model does not come near, where most that move the same
+/// joints are explained.
+fn outlying(selection: &Selection, batch: &[BatchWindow]) -> Vec<usize> {
+    let scales = noise_scales_by_place(selection);
+    let mut all = Vec::new();
+    for part in components(batch, false) {
+        let least = OUTLYING.0.max(OUTLYING.1 * usual_noise_scale(&part, &scales));
+        let is_far = |w: &&usize| scales.get(w).is_some_and(|scale| *scale >= least);
+        let far: Vec<usize> = part.windows.iter().filter(is_far).copied().collect();
+        if 3 * far.len() <= part.windows.len() {
+            all.extend(far);
+        }
     }
-    if 3 * far.len() <= all { far } else { Vec::new() }
+    all
+}
+
+fn joints_of(parts: impl Iterator<Item = Component>) -> Vec<usize> {
+    parts.flat_map(|part| part.joints).collect()
+}
+
+/// Joints that move together, where something was added to one of them.
+fn parts_with(batch: &[BatchWindow], selected: &Selection) -> impl Iterator<Item = Component> {
+    let joints: BTreeSet<usize> = selected.rivals.keys().filter_map(|addition| addition.joint()).collect();
+    components(batch, false).into_iter().filter(move |part| part.joints.iter().any(|joint| joints.contains(joint)))
+}
+
+/// Whether all that a model has more than another is a force over time, which says nothing of other windows.
+fn only_timed(selected: &Selection, fewer: &Selection) -> bool {
+    let mut more = selected.additions.difference(&fewer.additions);
+    more.all(|addition| matches!(addition, Addition::Table(_, TableKind::ForceOverTime)))
+}
+
+/// The selected model and its scores, without what the windows that it concerns do not bear out, joints that
+/// move together apart from the others.
+///
+/// # Errors
+/// Where no joint's windows are explained better than by noise.
+fn confirmed(
+    selector: &Selector<'_>,
+    base: &Selection,
+    before: &Scores,
+    mut selected: Selection,
+) -> Result<(Selection, Scores), Failure> {
+    let batch = selector.batch;
+    let parts = components(batch, false);
+    // What explains most windows no better than noise would says nothing of what they lack.
+    let scales = noise_scales_by_place(&selected);
+    let by_noise = |part: &Component| usual_noise_scale(part, &scales) >= OUTLYING.0;
+    if parts.iter().all(by_noise) {
+        return Err(Failure::Diverged);
+    }
+    let hopeless = joints_of(parts.into_iter().filter(by_noise));
+    if !hopeless.is_empty() {
+        tracing::debug!(?hopeless, "explained by noise alone");
+        selected = selector.restored(selected, base, &hopeless, false)?;
+    }
+    let all: Vec<usize> = (0..batch.len()).collect();
+    while !selected.rivals.is_empty() {
+        // What does not predict windows not yet learned better is not there.
+        let after = scores(selector.workshop, batch, &selected)?;
+        let worse = |windows: &[usize]| after.better_on(windows, before) == Some(false);
+        let refuted = joints_of(parts_with(batch, &selected).filter(|part| worse(&part.windows)));
+        let of_sensor = selected.rivals.keys().any(|addition| addition.joint().is_none());
+        let sensor = of_sensor && refuted.is_empty() && worse(&all);
+        if refuted.is_empty() && !sensor {
+            return Ok((selected, after));
+        }
+        tracing::debug!(?refuted, sensor, before = ?before.densities, after = ?after.densities, "predicts no better");
+        selected = selector.restored(selected, base, &refuted, sensor)?;
+    }
+    Ok((selected, before.clone()))
 }

@@ -2,12 +2,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use nalgebra::DVector;
-
 use super::numbers::{Addition, Numbers, Workshop};
 use super::selection::{Component, Selection};
 use super::statistics::whiteness;
-use crate::inference::{Failure, Gaussian};
+use crate::inference::Failure;
 use crate::math::median;
 use crate::mechanism::JointType;
 use crate::model::{BatchWindow, Hypothesis, WindowResidual};
@@ -16,6 +14,8 @@ use crate::types::posterior::ResidualScore;
 
 /// Positions are simulated this far \[s\].
 const HORIZON_S: f64 = 1.0;
+/// Linearizations of a fit to some of the windows; κ is as all of them have it.
+const STEPS: (usize, usize) = (5, 0);
 /// Lags that whiteness is tested over.
 const LAGS: usize = 10;
 
@@ -24,10 +24,34 @@ const LAGS: usize = 10;
 pub struct Scores {
     /// As published.
     pub rows: Vec<ResidualScore>,
+    /// By place in the batch of the windows that could be scored \[nats\].
+    pub densities: BTreeMap<usize, f64>,
+}
+
+impl Scores {
     /// Over all scored windows \[nats\].
-    pub log_predictive_density: f64,
-    /// How many windows were scored.
-    pub windows: usize,
+    pub fn log_predictive_density(&self) -> f64 {
+        self.densities.values().sum()
+    }
+
+    /// Whether force and position together are simulated better, over all parts.
+    pub fn simulates_better_than(&self, other: &Self) -> bool {
+        let lack = |row: &ResidualScore| {
+            let force = row.force_rmse_n.or(row.torque_rmse_nm).unwrap_or(0.0).max(1e-30);
+            force.ln() + (row.position_rmse_m.hypot(row.rotation_rmse_rad)).max(1e-30).ln()
+        };
+        let sum = |scores: &Self| scores.rows.iter().map(lack).sum::<f64>();
+        self.rows.len() == other.rows.len() && sum(self) < sum(other)
+    }
+
+    /// Whether some windows, those that could be scored `before`, are predicted better than there; none where
+    /// none could be.
+    pub fn better_on(&self, windows: &[usize], before: &Self) -> Option<bool> {
+        let pairs = windows.iter().filter_map(|w| Some((self.densities.get(w), before.densities.get(w)?)));
+        let gains: Vec<Option<f64>> = pairs.map(|(own, other)| Some(own? - other)).collect();
+        // What cannot be scored any more is not predicted better.
+        (!gains.is_empty()).then(|| gains.into_iter().sum::<Option<f64>>().is_some_and(|gain| gain > 0.0))
+    }
 }
 
 /// One scored window.
@@ -37,18 +61,17 @@ struct Scored {
     residual: WindowResidual,
 }
 
-/// Scores a selected model on its windows.
+/// Scores a selected model on its windows; what cannot be scored of one component is no matter of the others.
 pub fn scores(workshop: &Workshop<'_>, batch: &[BatchWindow], selection: &Selection) -> Result<Scores, Failure> {
     let hypothesis = workshop.hypothesis(&selection.additions)?;
     let mut scored: Vec<Scored> = Vec::new();
     for component in &selection.components {
-        scored.extend(sequence(&hypothesis, &selection.additions, &selection.numbers, component, batch)?);
+        match sequence(&hypothesis, &selection.additions, &selection.numbers, component, batch) {
+            Ok(own) => scored.extend(own),
+            Err(failure) => tracing::debug!(joints = ?component.joints, %failure, "not scored"),
+        }
     }
-    let mut scores = Scores {
-        rows: Vec::new(),
-        log_predictive_density: scored.iter().map(|s| s.log_density).sum(),
-        windows: scored.len(),
-    };
+    let mut scores = Scores { rows: Vec::new(), densities: scored.iter().map(|s| (s.window, s.log_density)).collect() };
     let mut by_joint: BTreeMap<usize, Vec<(usize, &Scored)>> = BTreeMap::new();
     for one in &scored {
         for (column, joint) in batch[one.window].moving.iter().enumerate() {
@@ -63,6 +86,9 @@ pub fn scores(workshop: &Workshop<'_>, batch: &[BatchWindow], selection: &Select
 }
 
 /// The windows of a component but the first of each set of joints, each by those before it.
+///
+/// P(window | those before it) is the evidence of all up to it over that of those before it: each at an optimum of
+/// its own, as what a few windows leave open may be curved, and no Gaussian stands for it.
 fn sequence(
     hypothesis: &Hypothesis,
     additions: &BTreeSet<Addition>,
@@ -72,43 +98,30 @@ fn sequence(
 ) -> Result<Vec<Scored>, Failure> {
     let mut scored = Vec::new();
     let whole = component.fitted.as_ref().ok_or(Failure::NoInformation)?;
-    let mut x = numbers.laid_out(hypothesis, additions);
-    for (k, &w) in component.windows.iter().enumerate().skip(1) {
-        let window = &batch[w];
-        let known: Vec<&BatchWindow> = component.windows[..k].iter().map(|&w| &batch[w]).collect();
-        if !window.moving.iter().all(|joint| known.iter().any(|other| other.moving.contains(joint))) {
-            continue;
+    let windows: Vec<&BatchWindow> = component.windows.iter().map(|&w| &batch[w]).collect();
+    let scales: Vec<f64> = whole.windows.iter().map(|w| w.noise_scale).collect();
+    let now = numbers.laid_out(hypothesis, additions);
+    let mut learned = hypothesis.fit(&windows[..1], &now, &scales[..1], STEPS)?;
+    for (k, window) in windows.iter().enumerate().skip(1) {
+        // The last of them ends at what was fitted to all, which need not be found again.
+        let with = if k + 1 == windows.len() {
+            whole.clone()
+        } else {
+            let fits = [&learned.x, &now].map(|x| hypothesis.fit(&windows[..=k], x, &scales[..=k], STEPS));
+            let best = fits.into_iter().flatten().max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence));
+            best.ok_or(Failure::Diverged)?
+        };
+        let known = &windows[..k];
+        if window.moving.iter().all(|joint| known.iter().any(|other| other.moving.contains(joint))) {
+            let constant = 0.5 * with.windows[k].observations as f64 * std::f64::consts::TAU.ln();
+            let log_density = with.log_evidence - learned.log_evidence - constant;
+            let usual = median(scales[..k].to_vec()).ok_or(Failure::NoInformation)?;
+            let residual = hypothesis.window(window, usual).residual(&learned.x, HORIZON_S)?;
+            scored.push(Scored { window: component.windows[k], log_density, residual });
         }
-        let scales: Vec<f64> = whole.windows[..k].iter().map(|w| w.noise_scale).collect();
-        let learned = hypothesis.fit(&known, &x, &scales, (5, 0))?;
-        x.clone_from(&learned.x);
-        let usual = median(scales).ok_or(Failure::NoInformation)?;
-        let mut posterior = hypothesis.clone();
-        posterior.prior = learned_prior(hypothesis, &learned)?;
-        // The mode of what the window says is sought from what was known and from what is known now.
-        let now = numbers.laid_out(hypothesis, additions);
-        let fits = [(&x, usual), (&now, whole.windows[k].noise_scale)]
-            .map(|(start, scale)| posterior.fit(&[window], start, &[scale], (4, 1)));
-        let best = fits.into_iter().flatten().max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence));
-        let fresh = best.ok_or(Failure::Diverged)?;
-        let log_density = fresh.log_evidence - 0.5 * fresh.windows[0].observations as f64 * std::f64::consts::TAU.ln();
-        let residual = hypothesis.window(window, usual).residual(&x, HORIZON_S)?;
-        scored.push(Scored { window: w, log_density, residual });
+        learned = with;
     }
     Ok(scored)
-}
-
-/// The prior with what was learned in the place of what it said of the same numbers.
-fn learned_prior(hypothesis: &Hypothesis, learned: &crate::model::BatchFit) -> Result<Gaussian, Failure> {
-    let mean = DVector::from_iterator(learned.active.len(), learned.active.iter().map(|&i| learned.x[i]));
-    let own = Gaussian::from_moments(&mean, &learned.covariance)?;
-    let all = hypothesis.prior.dimension();
-    let others: Vec<usize> = (0..all).filter(|i| learned.active.binary_search(i).is_err()).collect();
-    let rest = hypothesis.prior.marginal(&others)?;
-    let mut prior = Gaussian::flat(all);
-    prior.multiply_at(&own, &learned.active);
-    prior.multiply_at(&rest, &others);
-    Ok(prior)
 }
 
 fn row(workshop: &Workshop<'_>, joint: usize, windows: &[(usize, &Scored)]) -> ResidualScore {

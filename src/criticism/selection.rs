@@ -164,8 +164,9 @@ pub struct Selector<'a> {
     pub batch: &'a [BatchWindow],
     /// What the sensor read at rest.
     pub rest: Option<&'a RestReadings>,
-    /// What the last review found: joints that the newest window does not concern are only asked for it.
-    pub found: &'a BTreeSet<Addition>,
+    /// What the last review found: joints that the newest window does not concern are only asked for it. None
+    /// where there was no review of these joints: all are asked.
+    pub found: Option<&'a BTreeSet<Addition>>,
 }
 
 /// A refitted candidate.
@@ -187,6 +188,12 @@ impl Trial {
     fn reduction(&self) -> f64 {
         let windows = self.fits.iter().flat_map(|(_, fitted)| &fitted.windows);
         median(windows.map(|window| window.reduction).collect()).unwrap_or(1.0)
+    }
+
+    /// κ of the usual window.
+    fn usual_noise_scale(&self) -> f64 {
+        let windows = self.fits.iter().flat_map(|(_, fitted)| &fitted.windows);
+        median(windows.map(|window| window.noise_scale).collect()).unwrap_or(1.0)
     }
 
     /// How many numbers it adds.
@@ -268,7 +275,6 @@ impl Selector<'_> {
 
     /// The declared physics with the end stops that the windows show.
     pub fn base(&self, numbers: &Numbers) -> Result<Selection, Failure> {
-        let declared = self.workshop.learner.declared_mechanism();
         let mut best: Option<Selection> = None;
         let mut bland = numbers.clone();
         bland.joints.clear();
@@ -289,28 +295,35 @@ impl Selector<'_> {
         }
         let mut current = best.ok_or(Failure::Diverged)?;
         self.settle(&mut current)?;
+        self.add_stops(&mut current);
+        Ok(current)
+    }
+
+    /// Adds the end stops that the windows show by a model: what it lacks may hide them.
+    fn add_stops(&self, current: &mut Selection) {
+        let declared = self.workshop.learner.declared_mechanism();
         for component in current.components.clone() {
             for &joint in &component.joints {
                 let moved = component.windows.iter().any(|&w| self.batch[w].moving.contains(&joint));
                 for upper in [false, true].into_iter().filter(|_| moved) {
                     let stop = Addition::Stop(joint, upper);
-                    if declared.joints[joint].stops[usize::from(upper)] || !self.may_halt(joint, upper) {
+                    let known = declared.joints[joint].stops[usize::from(upper)] || current.additions.contains(&stop);
+                    if known || !self.may_halt(joint, upper) {
                         continue;
                     }
                     let (low, high) = self.workshop.range(joint);
                     let start = vec![if upper { high } else { low }];
                     if let Ok(trial) =
-                        self.trial(&current, &Ranked { addition: stop, gain: 0.0, start, also: Vec::new() }, (5, 1))
+                        self.trial(current, &Ranked { addition: stop, gain: 0.0, start, also: Vec::new() }, (5, 1))
                     {
                         current.steps += trial.spent;
                         if trial.gain > STOP_GAIN {
-                            self.take(&mut current, &trial);
+                            self.take(current, &trial);
                         }
                     }
                 }
             }
         }
-        Ok(current)
     }
 
     /// Adds what the windows call for, until nothing gains enough.
@@ -358,9 +371,14 @@ impl Selector<'_> {
             }
             current.declined = trials.iter().map(|trial| (trial.addition, trial.gain)).collect();
             let least = LEAST_GAIN + candidates.ln();
-            let needs = |trial: &Trial| match trial.addition {
+            let needs_of = |addition: Addition| match addition {
                 Addition::Effect(_, EffectKind::Impulse) => least + PLACES.ln(),
                 _ => least,
+            };
+            let needs = |trial: &Trial| match trial.addition {
+                // It acts in one window: where others are not explained either, something acts in them all.
+                Addition::Effect(_, EffectKind::Impulse) if trial.usual_noise_scale() >= MISFIT => f64::INFINITY,
+                addition => needs_of(addition),
             };
             let Some(best) = trials.iter().find(|trial| trial.gain > needs(trial)).or(trials.first()) else { break };
             let part_of_it =
@@ -375,10 +393,13 @@ impl Selector<'_> {
                 // A right effect can gain nothing until its partner is in.
                 match self.pair(&current, best, friction_declared, least)? {
                     Some(pair) => {
-                        let Some(after) = self.holding(&pair, &held_out, &mut current.steps) else { break };
+                        let Some(after) = self.holding(&pair, &held_out, &current.additions, &mut current.steps) else {
+                            break;
+                        };
                         held_out = after;
                         current = Selection { steps: current.steps, ..pair };
                         self.settle(&mut current)?;
+                        self.add_stops(&mut current);
                         current.note_step();
                     }
                     None => break,
@@ -391,7 +412,7 @@ impl Selector<'_> {
             for trial in std::iter::once(best).chain(others).take(HELD_OUT_TRIES) {
                 let mut next = current.clone();
                 self.take(&mut next, trial);
-                if let Some(after) = self.holding(&next, &held_out, &mut current.steps) {
+                if let Some(after) = self.holding(&next, &held_out, &current.additions, &mut current.steps) {
                     taken = Some((trial, next, after));
                     break;
                 }
@@ -407,11 +428,20 @@ impl Selector<'_> {
                 .collect();
             rivals.push((None, -best.gain));
             let addition = best.addition;
+            let had = current.clone();
             current =
                 Selection { steps: current.steps, declined: current.declined, leftover: current.leftover, ..next };
             current.rivals.extend(best.also.iter().map(|other| (*other, vec![(None, -best.gain)])));
             current.rivals.insert(addition, rivals);
             self.settle(&mut current)?;
+            self.add_stops(&mut current);
+            // What gained by leading to a better optimum of the model before it is not needed itself.
+            if let Some(without) = self.as_good_without(&current, &had, needs_of(addition))? {
+                tracing::debug!(?addition, evidence = without.log_evidence, "a better optimum without");
+                held_out = HeldOut::of(self.workshop, self.batch, &without).unwrap_or_default();
+                current = Selection { rivals: had.rivals, stages: had.stages, ..without };
+                continue;
+            }
             self.drop_what_is_not_needed(&mut current, addition)?;
             current.note_step();
             richer = whole;
@@ -419,13 +449,29 @@ impl Selector<'_> {
         Ok(current)
     }
 
-    /// What windows left out lack by a model; none where it does not hold there against the one before it.
-    fn holding(&self, next: &Selection, before: &HeldOut, steps: &mut usize) -> Option<HeldOut> {
+    /// What windows left out lack by a model; none where it does not hold there against the one before it, with
+    /// the additions `had`, as far as the joints go that move with those in which the two differ.
+    fn holding(
+        &self,
+        next: &Selection,
+        before: &HeldOut,
+        had: &BTreeSet<Addition>,
+        steps: &mut usize,
+    ) -> Option<HeldOut> {
         let after = HeldOut::of(self.workshop, self.batch, next).ok()?;
         *steps += after.steps;
-        let ratios = after.ratios_to(before);
-        tracing::debug!(additions = ?next.additions, ?ratios, "left out");
-        after.holds_against(before).then_some(after)
+        let joints = self.concerned(had.symmetric_difference(&next.additions));
+        let ratios = after.ratios_to(before, &joints);
+        tracing::debug!(additions = ?next.additions, ?ratios, kappa = ?next.noise_scales_of(None), "left out");
+        after.holds_against(before, &joints).then_some(after)
+    }
+
+    /// The joints that move in the windows that additions concern.
+    fn concerned<'b>(&self, additions: impl Iterator<Item = &'b Addition>) -> Vec<usize> {
+        let mut parts = components(self.batch, false);
+        let joints: Vec<Option<usize>> = additions.map(|addition| addition.joint()).collect();
+        parts.retain(|part| joints.iter().any(|joint| joint.is_none_or(|joint| part.joints.contains(&joint))));
+        parts.into_iter().flat_map(|part| part.joints).collect()
     }
 
     /// The model with the best candidate and the best partner of it, if the two gain enough.
@@ -596,8 +642,9 @@ impl Selector<'_> {
                 .copied()
                 .filter(|joint| windows.iter().any(|w| w.moving.contains(joint)))
                 .collect();
-            let concerned = windows.iter().any(|w| Some(w.index) == newest);
-            let known = self.found.iter().filter(|a| a.joint().is_none_or(|joint| moved.contains(&joint)));
+            let concerned = self.found.is_none() || windows.iter().any(|w| Some(w.index) == newest);
+            let known =
+                self.found.into_iter().flatten().filter(|a| a.joint().is_none_or(|joint| moved.contains(&joint)));
             // A table may stand for anything: it describes what is left where nothing with a name does.
             let named = |a: &&Addition| !matches!(a, Addition::Stop(..) | Addition::Table(..));
             let known = known.filter(|a| !current.additions.contains(a)).filter(named);
@@ -824,6 +871,26 @@ impl Selector<'_> {
         }
     }
 
+    /// The model `had` before the newest addition, fitted anew from where that led, if it does as well but for
+    /// this much evidence.
+    fn as_good_without(&self, current: &Selection, had: &Selection, least: f64) -> Result<Option<Selection>, Failure> {
+        let stops = current.additions.iter().filter(|a| matches!(a, Addition::Stop(..)));
+        let additions: BTreeSet<Addition> = had.additions.iter().chain(stops).copied().collect();
+        let mut numbers = current.numbers.clone();
+        // What the newest took the place of is as it was.
+        numbers.added.extend(
+            had.numbers.added.iter().filter(|(a, _)| !current.additions.contains(a)).map(|(a, own)| (*a, own.clone())),
+        );
+        let mut without = self.fitted(&additions, &numbers, REFIT)?;
+        without.steps += current.steps;
+        let same = (without.log_evidence > current.log_evidence - least).then_some(without);
+        Ok(same.map(|without| Selection {
+            declined: current.declined.clone(),
+            leftover: current.leftover.clone(),
+            ..without
+        }))
+    }
+
     /// After a right effect is in, one that stood in for it may go.
     fn drop_what_is_not_needed(&self, current: &mut Selection, newest: Addition) -> Result<(), Failure> {
         let is_stop = |a: &Addition| matches!(a, Addition::Stop(..));
@@ -874,6 +941,54 @@ impl Selector<'_> {
             Some((Addition::Table(joint, kind), own.table_gain(kind, deviation, length)?))
         });
         gains.collect()
+    }
+
+    /// A model without its additions to some joints, or to the sensor, which are as in the `base` again.
+    pub fn restored(
+        &self,
+        mut selected: Selection,
+        base: &Selection,
+        joints: &[usize],
+        sensor: bool,
+    ) -> Result<Selection, Failure> {
+        let goes = |a: &Addition| a.joint().map_or(sensor, |joint| joints.contains(&joint));
+        let together = selected.additions.iter().any(|a| a.joint().is_none());
+        let without = |additions: &BTreeSet<Addition>| -> BTreeSet<Addition> {
+            let kept = additions.iter().filter(|a| !goes(a));
+            kept.chain(base.additions.iter().filter(|a| goes(a))).copied().collect()
+        };
+        selected.additions = without(&selected.additions);
+        selected.rivals.retain(|addition, _| !goes(addition));
+        selected.declined.retain(|(addition, _)| !goes(addition));
+        for step in &mut selected.stages {
+            step.additions = without(&step.additions);
+        }
+        let bare: BTreeSet<Addition> = base.additions.clone();
+        selected.stages.dedup_by(|a, b| a.additions == b.additions);
+        selected.stages.retain(|step| step.additions != bare);
+        for &joint in joints {
+            if let (Some(own), Some(other)) = (selected.numbers.joints.get_mut(joint), base.numbers.joints.get(joint)) {
+                own.clone_from(other);
+            }
+        }
+        let of_base = base.numbers.added.iter().filter(|(a, _)| base.additions.contains(a) && goes(a));
+        selected.numbers.added.extend(of_base.map(|(addition, own)| (*addition, own.clone())));
+        if together {
+            let fitted = self.fitted(&selected.additions, &selected.numbers, REFIT)?;
+            let Selection { rivals, stages, declined, leftover, steps, .. } = selected;
+            return Ok(Selection { rivals, stages, declined, leftover, steps: steps + fitted.steps, ..fitted });
+        }
+        for component in &mut selected.components {
+            let other = base.components.iter().find(|other| other.joints == component.joints);
+            let Some(other) = other.filter(|_| component.joints.iter().any(|joint| joints.contains(joint))) else {
+                continue;
+            };
+            let evidence = |component: &Component| component.fitted.as_ref().map_or(0.0, |fit| fit.log_evidence);
+            selected.log_evidence += evidence(other) - evidence(component);
+            component.fitted.clone_from(&other.fitted);
+        }
+        self.lay_out(&mut selected);
+        Ok(selected)
     }
 
     /// The model before the last addition, fitted anew; none where what was added took the place of something.
@@ -934,7 +1049,7 @@ impl Selector<'_> {
             let trial = self.trial(&current, &Ranked { addition, gain, start: Vec::new(), also: Vec::new() }, REFIT)?;
             let mut next = current.clone();
             self.take(&mut next, &trial);
-            let Some(after) = self.holding(&next, &held_out, &mut current.steps) else { continue };
+            let Some(after) = self.holding(&next, &held_out, &current.additions, &mut current.steps) else { continue };
             held_out = after;
             current = Selection { steps: current.steps, ..next };
             current.rivals.insert(addition, vec![(None, -trial.gain)]);

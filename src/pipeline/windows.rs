@@ -15,6 +15,8 @@ use crate::types::{AppliedWrench, Label, SegmentedCloud, Stamp};
 /// Frames of a window are this far apart at least \[s\]: registration's errors are shared by frames that are
 /// closer, which cost time and memory all the same.
 const FRAME_SPACING: f64 = 0.06;
+/// A tool this much farther from a part than at their contact has let go of it \[m\].
+const LEAVES: f64 = 0.03;
 /// A torque without force counts as the force that makes it at this lever \[m\].
 const TORQUE_LEVER: f64 = 0.1;
 
@@ -122,6 +124,10 @@ pub struct WindowCutter {
     frames: VecDeque<Frame>,
     open_since: Option<f64>,
     last_contact_s: f64,
+    /// The part nearest to the tool then and its distance \[m\], as far as clouds show.
+    touched: Option<(Label, f64)>,
+    /// Whether the tool has gone from it since.
+    left: bool,
 }
 
 impl WindowCutter {
@@ -132,6 +138,8 @@ impl WindowCutter {
             frames: VecDeque::new(),
             open_since: None,
             last_contact_s: f64::NEG_INFINITY,
+            touched: None,
+            left: false,
         }
     }
 
@@ -166,8 +174,18 @@ impl WindowCutter {
                 previous + (now - previous) * f64::from(i) / f64::from(steps) - 0.5 * self.readings.settings.smoothing_s
             })
             .any(|t| self.readings.active_at(t, None));
+        // What is let go may move on by itself while the tool goes to take hold anew: two contacts, two windows.
+        let silent = now - self.last_contact_s > self.readings.settings.quiet_s;
+        if !active && let Some((label, distance)) = self.touched {
+            self.left |= self.readings.distance(&frame, label).is_some_and(|now| now > distance + LEAVES);
+        }
+        let touched = if active { self.readings.touched(&frame) } else { None };
+        let another = touched.zip(self.touched).is_some_and(|((label, _), (before, _))| label != before);
+        let let_go = (active && silent && (another || self.left) && self.is_open()).then(|| self.close(previous));
         if active {
             self.last_contact_s = now;
+            self.touched = touched;
+            self.left = false;
         }
         // Registration sees motion where there is none; a measured pose does not.
         let opens = active || frame.moves;
@@ -193,7 +211,8 @@ impl WindowCutter {
         let opened = self.open_since?;
         let settings = &self.readings.settings;
         let quiet = now - self.last_contact_s >= settings.quiet_s && !moving;
-        (quiet || now - opened >= settings.longest_s).then(|| self.close(now))
+        let over = quiet || now - opened >= settings.longest_s;
+        let_go.or_else(|| over.then(|| self.close(now)))
     }
 
     /// The window that is open at the end of the stream.
@@ -225,7 +244,10 @@ impl WindowCutter {
         let last = self.frames.back().cloned();
         let frames = spaced(self.frames.drain(..));
         self.frames.extend(last);
-        let readings = self.readings.clone();
+        let mut readings = self.readings.clone();
+        while readings.wrenches.back().is_some_and(|w| readings.time(w) > now) {
+            readings.wrenches.pop_back();
+        }
         self.forget(now - 1.0);
         CutWindow { frames, readings }
     }
@@ -316,6 +338,19 @@ impl Readings {
                 rest.is_left(&(force / count), &(torque / count), least_n, least_n * TORQUE_LEVER)
             }
         })
+    }
+
+    /// The part whose points are nearest to the tool, and how near \[m\].
+    fn touched(&self, frame: &Frame) -> Option<(Label, f64)> {
+        let distances = frame.scans.keys().filter_map(|label| Some((*label, self.distance(frame, *label)?)));
+        distances.min_by(|a, b| a.1.total_cmp(&b.1))
+    }
+
+    /// From the tool to the nearest point of a part \[m\].
+    fn distance(&self, frame: &Frame, label: Label) -> Option<f64> {
+        let tool = self.wrenches.iter().rev().find(|w| w.tool && self.time(w) <= frame.time_s)?.point_in_world;
+        let scan = frame.scans.get(&label)?.iter();
+        scan.map(|point| (point.point_in_world - tool).norm()).min_by(f64::total_cmp)
     }
 
     /// Whether the noise of every tool's readings is known.
@@ -419,6 +454,61 @@ mod tests {
         assert_eq!(found.len(), 4, "{found:?}");
         assert!(found[0] == 0.0 && (found[3] - 7.0 / 30.0).abs() < 1e-12, "{found:?}");
         assert_eq!(times(60.0, 2, &scans).len(), 2);
+    }
+
+    /// The parts touched, by window, and how far the tool was moved while it is said to have touched the first; it
+    /// pushes one part from 1 s to 2 s and again from 2.8 s on what it then has gone to, at a distance \[m\].
+    fn touched_in(distance: f64, follows: bool) -> (Vec<Vec<Label>>, f64) {
+        let mut cutter = WindowCutter::new(WindowSettings::default(), Stamp(0));
+        let mut windows = Vec::new();
+        // The tool's track is smoothed over 50 ms either way.
+        let place = |time_s: f64| distance * ((time_s - 2.2) / 0.6).clamp(0.0, 1.0);
+        for k in 0..400_i64 {
+            let time_s = k as f64 * 0.01;
+            let pushed = (1.0..2.0).contains(&time_s) || time_s >= 2.8;
+            cutter.push_wrench(AppliedWrench {
+                stamp: Stamp(k * 10_000_000),
+                source: 0,
+                part: None,
+                tool: true,
+                point_in_world: Vector3::new(place(time_s), 0.0, 0.0),
+                force_in_world: Vector3::new(if pushed { 5.0 } else { 0.02 * (k % 3) as f64 }, 0.0, 0.0),
+                torque_in_world: Vector3::zeros(),
+            });
+            if k % 10 == 0 {
+                // What was pushed has not come to rest by the next push.
+                let at = |x: f64| {
+                    let point = Vector3::new(x, 0.1, 0.0);
+                    vec![ScanPoint { point_in_world: point, viewpoint_in_world: None }]
+                };
+                let first = if follows { place(time_s) } else { 0.0 };
+                let scans = BTreeMap::from([(Label(1), at(first)), (Label(2), at(1.0))]);
+                let frame = Frame { time_s, scans: scans.into(), ..Frame::default() };
+                windows.extend(cutter.push_frame(frame, time_s > 1.0));
+            }
+        }
+        windows.extend(cutter.flush());
+        let label = |x: &Vector3<f64>, _: &Frame| Some(Label(if x.x < 0.5 { 1 } else { 2 }));
+        let jobs: Vec<WindowJob> = windows.into_iter().map(|window| window.job(label)).collect();
+        let touched = jobs.iter().map(|job| job.contacts.iter().map(|c| c.label).collect()).collect();
+        let moved = jobs[0].contacts[0].track.iter().map(|(_, tool, _)| tool.x).fold(0.0, f64::max);
+        (touched, moved)
+    }
+
+    #[test]
+    fn a_part_that_moves_on_does_not_join_two_contacts() {
+        for (distance, second) in [(1.0, 2), (0.2, 1)] {
+            let (touched, moved) = touched_in(distance, false);
+            assert_eq!(touched, [vec![Label(1)], vec![Label(second)]]);
+            assert!(moved.abs() < 1e-9, "{moved}");
+        }
+    }
+
+    #[test]
+    fn what_is_held_without_force_is_one_contact() {
+        let (touched, moved) = touched_in(0.2, true);
+        assert_eq!(touched, [vec![Label(1)]]);
+        assert!((moved - 0.2).abs() < 1e-9, "{moved}");
     }
 
     #[test]
