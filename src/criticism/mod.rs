@@ -160,6 +160,12 @@ impl Critic {
             if !unscored.is_empty() {
                 selected = selector.restored(selected, &base, &unscored, false)?;
             }
+            let of_axes = explained_by_axes(&workshop, batch, &selected)?;
+            if !of_axes.is_empty() {
+                tracing::debug!(?of_axes, "no greater than the error of an axis");
+                selected = selector.restored(selected, &base, &of_axes, false)?;
+                after = scores(&workshop, batch, &selected)?;
+            }
             tracing::debug!(evidence = selected.log_evidence, steps = selected.steps, additions = ?selected.additions,
                 kappa = ?noise_scales(&selected, batch), before = before.log_predictive_density(), after = after.log_predictive_density(), "selected");
             // What weighs most decides: a name beside a stronger unknown explains little.
@@ -315,6 +321,34 @@ fn joints_of(parts: impl Iterator<Item = Component>) -> Vec<usize> {
 fn parts_with(batch: &[BatchWindow], selected: &Selection) -> impl Iterator<Item = Component> {
     let joints: BTreeSet<usize> = selected.rivals.keys().filter_map(|addition| addition.joint()).collect();
     components(batch, false).into_iter().filter(move |part| part.joints.iter().any(|joint| joints.contains(joint)))
+}
+
+/// Of a parameter's standard deviations, so many are not zero.
+const CLEARLY_THERE: f64 = 2.0;
+
+/// Joints all of whose effects vanish within what the errors of the axes leave open of them: evidence is taken at
+/// the axes as they were fitted, published spreads are not.
+fn explained_by_axes(
+    workshop: &Workshop<'_>,
+    batch: &[BatchWindow],
+    selected: &Selection,
+) -> Result<Vec<usize>, Failure> {
+    let Workshop { learner, fit, input, rest_prior, .. } = workshop;
+    if selected.rivals.is_empty() {
+        return Ok(Vec::new());
+    }
+    let hypothesis = workshop.hypothesis(&selected.additions)?;
+    let x = selected.numbers.laid_out(&hypothesis, &selected.additions);
+    let prior = rest_prior.as_ref().filter(|_| selected.additions.contains(&Addition::Bias));
+    let mut trial = (*learner).clone();
+    trial.adopt(&hypothesis, &x, &noise_scales(selected, batch), prior, (fit, input))?;
+    let mut clear: BTreeMap<Label, bool> = BTreeMap::new();
+    for effect in findings::effects(&trial, &hypothesis, selected, fit) {
+        let Some(label) = effect.label else { continue };
+        *clear.entry(label).or_default() |= effect.parameters.values().any(|q| q.mean.abs() > CLEARLY_THERE * q.std);
+    }
+    let vague = clear.into_iter().filter(|(_, clear)| !clear).map(|(label, _)| label);
+    Ok(vague.filter_map(|label| fit.joints.iter().position(|joint| joint.child == label)).collect())
 }
 
 /// Whether all that a model has more than another is a force over time, which says nothing of other windows.
