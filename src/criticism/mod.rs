@@ -26,7 +26,7 @@ use crate::mechanism::JointType;
 use crate::mechanism::effects::TableKind;
 use crate::model::{BatchWindow, DynamicsInput, DynamicsLearner, Hypothesis, KinematicFit};
 use crate::types::Label;
-use crate::types::posterior::{Criticism, Verdict};
+use crate::types::posterior::{Criticism, Quantity, Verdict};
 use rest::RestReadings;
 use score::{Scores, scores};
 
@@ -100,7 +100,6 @@ impl Critic {
         if reviewed == self.reviewed {
             return Ok(0);
         }
-        self.reviewed = reviewed;
         let rest = RestReadings::of(&batch, input, &SENSOR_SCALES);
         let spans = spans_of(input);
         let rest_prior = rest.as_ref().and_then(RestReadings::posterior);
@@ -206,6 +205,7 @@ impl Critic {
         self.stages = seed.1;
         self.findings = Some(findings);
         self.selection = Some(selected);
+        self.reviewed = reviewed;
         Ok(steps)
     }
 }
@@ -323,8 +323,8 @@ fn parts_with(batch: &[BatchWindow], selected: &Selection) -> impl Iterator<Item
     components(batch, false).into_iter().filter(move |part| part.joints.iter().any(|joint| joints.contains(joint)))
 }
 
-/// Of a parameter's standard deviations, so many are not zero.
-const CLEARLY_THERE: f64 = 2.0;
+/// A parameter is clearly there whose 90 % interval stays above this share of its median.
+const CLEARLY_THERE: f64 = 0.1;
 
 /// Joints all of whose effects vanish within what the errors of the axes leave open of them: evidence is taken at
 /// the axes as they were fitted, published spreads are not.
@@ -345,7 +345,8 @@ fn explained_by_axes(
     let mut clear: BTreeMap<Label, bool> = BTreeMap::new();
     for effect in findings::effects(&trial, &hypothesis, selected, fit) {
         let Some(label) = effect.label else { continue };
-        *clear.entry(label).or_default() |= effect.parameters.values().any(|q| q.mean.abs() > CLEARLY_THERE * q.std);
+        let is_clear = |q: &Quantity| (q.q05 / q.median).min(q.q95 / q.median) > CLEARLY_THERE;
+        *clear.entry(label).or_default() |= effect.parameters.values().any(is_clear);
     }
     let vague = clear.into_iter().filter(|(_, clear)| !clear).map(|(label, _)| label);
     Ok(vague.filter_map(|label| fit.joints.iter().position(|joint| joint.child == label)).collect())
