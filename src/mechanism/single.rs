@@ -79,28 +79,6 @@ impl<T: Real> SingleJoint<T> {
         Some(Self { body, screw, inertia: screw.dot(&momentum) + joint.parameters.armature, gravity })
     }
 
-    /// The numbers by which masses and where they are matter: J, then those of gravity.
-    pub fn mass_numbers(&self) -> Vec<T> {
-        match self.gravity {
-            Gravity::Constant(force) => vec![self.inertia, force],
-            Gravity::Turning(first, second) => vec![self.inertia, first, second],
-        }
-    }
-
-    /// The same joint with other [`Self::mass_numbers`], as many as it has.
-    #[must_use]
-    pub fn with_mass_numbers(self, numbers: &[T]) -> Self {
-        match (self.gravity, numbers) {
-            (Gravity::Constant(_), [inertia, force]) => {
-                Self { inertia: *inertia, gravity: Gravity::Constant(*force), ..self }
-            }
-            (Gravity::Turning(..), [inertia, first, second]) => {
-                Self { inertia: *inertia, gravity: Gravity::Turning(*first, *second), ..self }
-            }
-            _ => self,
-        }
-    }
-
     /// The generalized force of gravity at q \[N or N·m\].
     #[inline]
     pub fn gravity_force(&self, position: T) -> T {

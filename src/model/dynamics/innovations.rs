@@ -92,8 +92,9 @@ struct Advance {
 /// A span under way, chunk by chunk.
 struct Passage {
     span: [f64; 2],
+    /// How many parameters there are.
+    p: usize,
     after: DVector<f64>,
-    /// By the seeds.
     derivatives: DMatrix<f64>,
 }
 
@@ -142,42 +143,7 @@ pub(super) struct Plant<T: Real> {
     workspace: RefCell<Workspace<T>>,
 }
 
-/// What the derivatives of a single joint's motion are carried along: parameters, then the numbers by which
-/// masses matter, then q and q̇.
-struct Seeds {
-    /// Of the parameters that are seeds themselves: the place among the active ones, and the index.
-    own: Vec<(usize, usize)>,
-    /// Of the parameters that act through the joint's mass numbers alone: the place among the active ones.
-    of_mass: Vec<usize>,
-    /// The mass numbers.
-    numbers: Vec<f64>,
-    /// The mass numbers' derivatives by those parameters.
-    by_parameter: DMatrix<f64>,
-}
-
-impl Seeds {
-    /// How many there are before q and q̇.
-    fn count(&self) -> usize {
-        self.own.len() + self.numbers.len()
-    }
-
-    /// Derivatives by the `p` parameters, then by q and q̇, from those by the seeds.
-    fn expanded(&self, by_seed: &DMatrix<f64>, p: usize) -> DMatrix<f64> {
-        let size = by_seed.nrows();
-        let mut all = DMatrix::zeros(size, p + size);
-        for (k, (place, _)) in self.own.iter().enumerate() {
-            all.set_column(*place, &by_seed.column(k));
-        }
-        let through = by_seed.columns(self.own.len(), self.numbers.len()) * &self.by_parameter;
-        for (column, place) in through.column_iter().zip(&self.of_mass) {
-            all.set_column(*place, &column);
-        }
-        all.columns_mut(p, size).copy_from(&by_seed.columns(self.count(), size));
-        all
-    }
-}
-
-/// A plant with derivatives along some of the seeds.
+/// A plant with derivatives along some of the directions: first parameters, then q, then q̇.
 struct Chunk<const N: usize> {
     plant: Plant<DualSVec64<N>>,
     first: usize,
@@ -185,11 +151,10 @@ struct Chunk<const N: usize> {
     spans: Option<Vec<TableSpan>>,
 }
 
-/// Plants of a single joint that together cover all seeds.
+/// Plants of a single joint that together cover all directions.
 struct Forward {
     /// Without derivatives, to see where the joint goes.
     plain: Plant<f64>,
-    seeds: Seeds,
     eights: Vec<Chunk<8>>,
     four: Option<Chunk<4>>,
     two: Option<Chunk<2>>,
@@ -371,67 +336,29 @@ impl WindowModel<'_> {
     }
 
     fn forward(&self, x: &[f64], active: &[usize]) -> Result<Slopes, Failure> {
-        let plain = self.plant(x)?;
-        let seeds = self.seeds(&plain, x, active)?;
-        let directions = seeds.count() + 2 * self.moving.len();
+        let directions = active.len() + 2 * self.moving.len();
         let rest = directions % CHUNK;
         let whole = if rest > 4 { directions.div_ceil(CHUNK) } else { directions / CHUNK };
         let first = whole * CHUNK;
-        let eights = (0..whole).map(|k| self.chunk::<8>(x, &seeds, k * CHUNK));
+        let eights = (0..whole).map(|k| self.chunk::<8>(x, active, k * CHUNK));
         Ok(Slopes::Forward(Box::new(Forward {
-            plain,
+            plain: self.plant(x)?,
             eights: eights.collect::<Result<_, Failure>>()?,
-            four: (rest == 3 || rest == 4).then(|| self.chunk(x, &seeds, first)).transpose()?,
-            two: (rest == 1 || rest == 2).then(|| self.chunk(x, &seeds, first)).transpose()?,
-            seeds,
+            four: (rest == 3 || rest == 4).then(|| self.chunk(x, active, first)).transpose()?,
+            two: (rest == 1 || rest == 2).then(|| self.chunk(x, active, first)).transpose()?,
         })))
     }
 
-    /// Few seeds: what acts through the joint's mass numbers goes by them, where they are fewer.
-    fn seeds(&self, plain: &Plant<f64>, x: &[f64], active: &[usize]) -> Result<Seeds, Failure> {
-        let all = active.iter().copied().enumerate();
-        let (of_mass, own): (Vec<_>, Vec<_>) = all.partition(|&(_, at)| self.mechanism.is_of_mass(at));
-        let single = plain.single.as_ref().filter(|single| *self.moving == [single.body]);
-        let numbers = single.map_or_else(Vec::new, SingleJoint::mass_numbers);
-        if numbers.is_empty() || of_mass.len() <= numbers.len() {
-            let own = active.iter().copied().enumerate().collect();
-            return Ok(Seeds { own, of_mass: Vec::new(), numbers: Vec::new(), by_parameter: DMatrix::zeros(0, 0) });
-        }
-        let mut by_parameter = DMatrix::zeros(numbers.len(), of_mass.len());
-        for (part, places) in of_mass.chunks(CHUNK).enumerate() {
-            let mut parameters: Vec<DualSVec64<CHUNK>> = x.iter().map(|&v| Real::constant(v)).collect();
-            for (i, &(_, at)) in places.iter().enumerate() {
-                parameters[at] = parameters[at].derivative(i);
-            }
-            let plant = self.plant(&parameters)?;
-            let numbers = plant.single.as_ref().map_or_else(Vec::new, SingleJoint::mass_numbers);
-            for (row, number) in numbers.iter().enumerate() {
-                let Some(eps) = &number.eps.0 else { continue };
-                (0..places.len()).for_each(|i| by_parameter[(row, part * CHUNK + i)] = eps[i]);
-            }
-        }
-        Ok(Seeds { own, of_mass: of_mass.into_iter().map(|(place, _)| place).collect(), numbers, by_parameter })
-    }
-
-    /// The plant with derivatives along the seeds from the `first` on.
-    fn chunk<const N: usize>(&self, x: &[f64], seeds: &Seeds, first: usize) -> Result<Chunk<N>, Failure> {
+    /// The plant with derivatives along the directions from the `first` on.
+    fn chunk<const N: usize>(&self, x: &[f64], active: &[usize], first: usize) -> Result<Chunk<N>, Failure> {
         let mut parameters: Vec<DualSVec64<N>> = x.iter().map(|&v| Real::constant(v)).collect();
-        let own = seeds.own.iter().enumerate().skip(first).take(N);
-        for (i, &(_, at)) in own.clone() {
+        let own = active.iter().enumerate().skip(first).take(N);
+        for (i, &at) in own.clone() {
             parameters[at] = parameters[at].derivative(i - first);
         }
-        let mut plant = self.plant(&parameters)?;
-        let numbers = seeds.numbers.iter().enumerate().map(|(k, &number)| {
-            let constant: DualSVec64<N> = Real::constant(number);
-            let seed = (seeds.own.len() + k).checked_sub(first).filter(|seed| *seed < N);
-            seed.map_or(constant, |seed| constant.derivative(seed))
-        });
-        if let Some(single) = plant.single.filter(|_| !seeds.numbers.is_empty()) {
-            plant.single = Some(single.with_mass_numbers(&numbers.collect::<Vec<_>>()));
-        }
-        let parameters_only = first + N <= seeds.own.len();
-        let spans: Option<Vec<TableSpan>> = own.map(|(_, &(_, at))| self.table_span(at)).collect();
-        Ok(Chunk { plant, first, spans: spans.filter(|_| parameters_only) })
+        let parameters_only = first + N <= active.len();
+        let spans: Option<Vec<TableSpan>> = own.map(|(_, &at)| self.table_span(at)).collect();
+        Ok(Chunk { plant: self.plant(&parameters)?, first, spans: spans.filter(|_| parameters_only) })
     }
 
     /// Where a number matters that is an entry of a table of a joint that moves.
@@ -482,8 +409,7 @@ impl WindowModel<'_> {
             Slopes::Chain(chain) => return self.advance_chain(chain, state, span, p),
         };
         let size = state.len();
-        let directions = forward.seeds.count() + size;
-        let mut passage = Passage { span, after: DVector::zeros(size), derivatives: DMatrix::zeros(size, directions) };
+        let mut passage = Passage { span, p, after: DVector::zeros(size), derivatives: DMatrix::zeros(size, p + size) };
         let mut reach = None;
         for chunk in &forward.eights {
             if let Some(spans) = &chunk.spans {
@@ -500,7 +426,7 @@ impl WindowModel<'_> {
         }
         forward.four.iter().try_for_each(|chunk| self.pass(chunk, state, &mut passage))?;
         forward.two.iter().try_for_each(|chunk| self.pass(chunk, state, &mut passage))?;
-        Ok((passage.after, forward.seeds.expanded(&passage.derivatives, p)))
+        Ok((passage.after, passage.derivatives))
     }
 
     /// The transition of a covariance from the one of a state: a joint of a chain that
@@ -580,12 +506,11 @@ impl WindowModel<'_> {
         state: &DVector<f64>,
         passage: &mut Passage,
     ) -> Result<(), Failure> {
-        let size = state.len();
-        let directions = passage.derivatives.ncols();
+        let (size, p) = (state.len(), passage.p);
         let start: Vec<DualSVec64<N>> = (0..size)
             .map(|i| {
                 let value: DualSVec64<N> = Real::constant(state[i]);
-                match (directions - size + i).checked_sub(chunk.first) {
+                match (p + i).checked_sub(chunk.first) {
                     Some(direction) if direction < N => value.derivative(direction),
                     _ => value,
                 }
@@ -594,7 +519,7 @@ impl WindowModel<'_> {
         for (i, value) in self.advance(&chunk.plant, &start, passage.span)?.iter().enumerate() {
             passage.after[i] = value.re;
             if let Some(eps) = &value.eps.0 {
-                for direction in 0..N.min(directions - chunk.first) {
+                for direction in 0..N.min(p + size - chunk.first) {
                     passage.derivatives[(i, chunk.first + direction)] = eps[direction];
                 }
             }

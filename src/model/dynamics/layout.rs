@@ -442,13 +442,6 @@ impl Mechanism {
         self.offset(self.joints.len()) + SENSOR_SIZE
     }
 
-    /// Whether a number says only how heavy a body is and how its mass lies.
-    pub fn is_of_mass(&self, at: usize) -> bool {
-        let offsets = (0..self.joints.len()).map(|joint| self.offset(joint));
-        let own = offsets.take_while(|offset| *offset <= at).last().map_or(at, |offset| at - offset);
-        [INERTIA, MASS, CENTER, CENTER + 1].contains(&own)
-    }
-
     /// The sensor's numbers that the model has, counted from the sensor's first.
     pub fn active_sensor(&self) -> Vec<usize> {
         let bias = (0..6).filter(|_| self.sensor.bias);

@@ -21,8 +21,6 @@ const NOISE_SCALES: [f64; 6] = [1.0, 3.0, 10.0, 30.0, 100.0, 300.0];
 const LOG_NOISE_DEVIATION: f64 = 1.5;
 /// Weight, in innovations, of the prior that innovations have unit variance.
 const VARIANCE_PRIOR: f64 = 10.0;
-/// Steps at most before κ is chosen.
-const ROUGH_STEPS: usize = 7;
 /// Half a deviation of a kinematic number changes innovations by this much at most, root mean square.
 const RUNAWAY: f64 = 30.0;
 /// A stuck joint's load is known to this share: friction below the load is unlikelier than that.
@@ -142,15 +140,13 @@ impl WindowFit<'_> {
         let rounds = if noise_scale.is_some() { 1 } else { 2 };
         for round in 0..rounds {
             let mut problem = self.problem(scale);
-            let last = round + 1 == rounds;
-            let steps = if last { steps } else { steps.min(ROUGH_STEPS) };
             let settings = SolverSettings { steps, ..SolverSettings::default() };
             let solution = solve(&mut problem, prior, &point, &settings)?;
             spent += solution.steps;
-            if !last {
+            if round + 1 < rounds {
                 let (best, tried) = self.best_noise_scale(&solution.point, scale, &problem.latest)?;
                 spent += tried;
-                if best != scale || solution.steps == steps {
+                if best != scale {
                     scale = best;
                     point = solution.point;
                     continue;
