@@ -183,8 +183,8 @@ fn what_is_no_model_of_this_object_is_refused() {
     failed(&load(&broken), &["broken.json: damaged: the content's SHA-256 is"]);
     fs::write(&broken, &text[..text.len() / 2]).unwrap();
     failed(&load(&broken), &["broken.json: no saved model: EOF"]);
-    fs::write(&broken, text.replacen("bom.model/2", "bom.model/9", 1)).unwrap();
-    failed(&load(&broken), &["broken.json: no saved model: schema `bom.model/9`, expected `bom.model/2`"]);
+    fs::write(&broken, text.replacen("bom.model/3", "bom.model/9", 1)).unwrap();
+    failed(&load(&broken), &["broken.json: no saved model: schema `bom.model/9`, expected `bom.model/3`"]);
 
     let root = replay(&second, &["--load-model", model.to_str().unwrap(), "--root-label", "2"]);
     failed(&root, &["first.json: its root is part 4, not 2"]);

@@ -1,6 +1,6 @@
 //! Saved models: a learned object with the bags that it was learned from, as JSON.
 //!
-//! `{"schema": "bom.model/2", "sha256": …, "content": {"bags": […], "object": {…}}}`: the sum is that of
+//! `{"schema": "bom.model/3", "sha256": …, "content": {"bags": […], "object": {…}}}`: the sum is that of
 //! the content's text, so that no damage is taken for an object. The same object gives the same bytes.
 
 use std::{
@@ -18,7 +18,7 @@ use super::{bag::BagMessage, config::InputConfig, topics::Role};
 use crate::pipeline::{SavedObject, SavedObjectRef};
 
 /// Name and version of the format.
-pub const SCHEMA: &str = "bom.model/2";
+pub const SCHEMA: &str = "bom.model/3";
 
 /// A saved model.
 #[derive(Debug, Deserialize)]
@@ -171,7 +171,7 @@ mod tests {
         assert!(
             error("{\"schema\": \"bom.posterior/1\", \"edges\": []}").contains("schema `bom.posterior/1`, expected")
         );
-        let other = "{\"schema\": \"bom.model/2\", \"sha256\": \"00\", \"content\": {\"bags\": []}}";
+        let other = "{\"schema\": \"bom.model/3\", \"sha256\": \"00\", \"content\": {\"bags\": []}}";
         assert!(error(other).starts_with("m.json: damaged: the content's SHA-256 is "), "{}", error(other));
         let sum = sha256(b"{\"bags\": []}");
         let other = other.replace("\"00\"", &format!("\"{sum}\""));

@@ -37,6 +37,8 @@ const RELEASE_STEPS: usize = 5;
 const SHORTEST_HALT: f64 = 0.1;
 /// Effects in time are expected within a record of this length \[s\].
 const TYPICAL_RECORD_S: f64 = 4.0;
+/// A joint that goes farther beyond an end than this has no stop there \[m or rad\].
+const PASSED: f64 = 5.0 * LIMIT_DEVIATION;
 /// A stop is believed if it raises the log evidence by this.
 const STOP_EVIDENCE: f64 = 4.0;
 
@@ -236,7 +238,7 @@ impl DynamicsLearner {
             return WindowInference::default();
         };
         self.windows[newest].contacts = input.contacts.to_vec();
-        if let Err(failure) = self.follow(fit, input) {
+        if let Err(failure) = self.follow(fit, input).and_then(|()| self.drop_passed_stops(fit)) {
             return WindowInference { failure: Some(failure), ..WindowInference::default() };
         }
         let mut result = self
@@ -652,6 +654,29 @@ impl DynamicsLearner {
         self.belief.replace(Site::Window(window), Factor { blocks: vec![(block, mean.len())], gaussian });
         self.windows[window].learned = true;
         Ok(WindowInference { steps: 1, ..WindowInference::default() })
+    }
+
+    /// A stop that its joint has gone beyond was none: what windows said of the joint with it is learned anew.
+    fn drop_passed_stops(&mut self, fit: &KinematicFit) -> Result<(), Failure> {
+        let mut passed = Vec::new();
+        for (k, joint) in fit.joints.iter().enumerate() {
+            let (low, high) = self.range_of(k, fit);
+            let Some(memory) = self.joints.get_mut(&joint.child) else { continue };
+            let [lower, upper] = memory.stop_positions;
+            for (side, beyond) in [lower - low, high - upper].into_iter().enumerate() {
+                if memory.stops[side] && beyond > PASSED {
+                    tracing::debug!(label = %joint.child, side, beyond, "end stop passed");
+                    memory.stops[side] = false;
+                    memory.stop_positions[side] = 0.0;
+                    passed.push(joint.child);
+                }
+            }
+        }
+        if passed.is_empty() {
+            return Ok(());
+        }
+        passed.into_iter().for_each(|label| self.forget_sites(label));
+        self.rebuild(fit)
     }
 
     /// The (joint, side, position) where a joint arrived at an end of all its positions so far.

@@ -270,6 +270,27 @@ fn an_end_that_a_joint_runs_into_is_a_stop_and_one_where_it_turns_round_is_none(
 }
 
 #[test]
+fn a_stop_that_a_joint_goes_beyond_was_none() {
+    let free = Truth::single(true, 0.3, 0.4, 2.5);
+    let mut bodies = vec![body(&free.joints[0], 2.5, Vector3::new(0.2, 0.0, 0.0), 0.3, 0.4)];
+    bodies[0].parameters.upper = Some(Limit::at(0.45));
+    let held = Truth { tree: Tree::new(bodies, GRAVITY).unwrap(), ..Truth::single(true, 0.3, 0.4, 2.5) };
+    let mut learner = DynamicsLearner::new(GRAVITY);
+    let (mut windows, mut positions, mut stops) = (Vec::new(), Vec::new(), Vec::new());
+    for truth in [&held, &free] {
+        let (window, contact, q) = truth.window(2.5, 0.7, 2.0, &mut ChaCha8Rng::seed_from_u64(5));
+        windows.push(window);
+        positions.push(q);
+        let all: Vec<&WindowObservations> = windows.iter().collect();
+        let contacts = &[contact];
+        let input = DynamicsInput { windows: &all, contacts, zero: Stamp(0), parts: &truth.hulls, use_tool: true };
+        learner.learn_window(&truth.fit(&positions), &input);
+        stops.push(learner.mechanism().joints[0].stops);
+    }
+    assert_eq!(stops, [[false, true], [false, false]]);
+}
+
+#[test]
 fn gravity_shows_how_a_slide_lies() {
     let (damping, friction, tilt) = (8.0, 3.0, 0.03);
     let truth = Truth::single(false, damping, friction, 2.5);
