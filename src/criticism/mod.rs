@@ -26,7 +26,7 @@ use crate::mechanism::JointType;
 use crate::mechanism::effects::TableKind;
 use crate::model::{BatchWindow, DynamicsInput, DynamicsLearner, Hypothesis, KinematicFit};
 use crate::types::Label;
-use crate::types::posterior::{Criticism, Quantity, Verdict};
+use crate::types::posterior::{Criticism, EffectPosterior, Quantity, Verdict};
 use rest::RestReadings;
 use score::{Scores, scores};
 
@@ -109,7 +109,7 @@ impl Critic {
         let known_joints = known.is_some();
         let added = known.map_or_else(BTreeMap::new, |(_, numbers)| numbers.added.clone());
         let numbers = Numbers { joints, sensor, added };
-        let (selected, findings, scales, seed) = {
+        let (selected, findings, with, seed) = {
             let workshop =
                 Workshop { learner, fit, input, rest_prior: rest_prior.clone(), sensor_scales: SENSOR_SCALES, spans };
             let found = self.stages.last().map(|step| step.additions.clone()).unwrap_or_default();
@@ -159,11 +159,13 @@ impl Critic {
             if !unscored.is_empty() {
                 selected = selector.restored(selected, &base, &unscored, false)?;
             }
-            let of_axes = explained_by_axes(&workshop, batch, &selected)?;
+            let mut published = published(&workshop, batch, &selected)?;
+            let of_axes = explained_by_axes(&published.1, fit);
             if !of_axes.is_empty() {
                 tracing::debug!(?of_axes, "no greater than the error of an axis");
                 selected = selector.restored(selected, &base, &of_axes, false)?;
                 after = scores(&workshop, batch, &selected)?;
+                published = self::published(&workshop, batch, &selected)?;
             }
             tracing::debug!(evidence = selected.log_evidence, steps = selected.steps, additions = ?selected.additions,
                 kappa = ?noise_scales(&selected, batch), before = before.log_predictive_density(), after = after.log_predictive_density(), "selected");
@@ -180,25 +182,21 @@ impl Critic {
                 () if !selected.rivals.is_empty() || leaves_much(&workshop, &selected, &after) => Verdict::Unexplained,
                 () => Verdict::Adequate,
             };
-            let findings = Criticism { verdict, effects: Vec::new(), before: before.rows, after: after.rows };
-            let scales = noise_scales(&selected, batch);
-            (selected, findings, scales, seed)
-        };
-        let found = findings.verdict != Verdict::Insufficient && !selected.rivals.is_empty();
-        let mut findings = findings;
-        if found || self.adopted {
-            let additions = if found { selected.additions.clone() } else { BTreeSet::new() };
-            let spans = spans_of(input);
-            let hypothesis =
-                Workshop { learner, fit, input, rest_prior: rest_prior.clone(), sensor_scales: SENSOR_SCALES, spans }
-                    .hypothesis(&additions)?;
-            let x = selected.numbers.laid_out(&hypothesis, &additions);
-            let prior = rest_prior.as_ref().filter(|_| additions.contains(&Addition::Bias));
-            learner.adopt(&hypothesis, &x, &scales, prior, (fit, input))?;
+            let mut findings = Criticism { verdict, effects: Vec::new(), before: before.rows, after: after.rows };
+            let found = findings.verdict != Verdict::Insufficient && !selected.rivals.is_empty();
+            let with = if found {
+                findings.effects = published.1;
+                published.0
+            } else if self.adopted {
+                Some(taken_over(&workshop, batch, &selected, &BTreeSet::new())?.0)
+            } else {
+                None
+            };
             self.adopted = found;
-            if found {
-                findings.effects = findings::effects(learner, &hypothesis, &selected, fit);
-            }
+            (selected, findings, with, seed)
+        };
+        if let Some(with) = with {
+            *learner = with;
         }
         let steps = selected.steps;
         self.known = Some((labels, seed.0));
@@ -272,15 +270,7 @@ fn spans_of(input: &DynamicsInput<'_>) -> Vec<[f64; 2]> {
 
 /// κ by window.
 fn noise_scales(selection: &Selection, batch: &[BatchWindow]) -> Vec<(usize, f64)> {
-    let mut scales: Vec<(usize, f64)> = Vec::new();
-    for component in &selection.components {
-        if let Some(fitted) = &component.fitted {
-            let own = component.windows.iter().zip(&fitted.windows);
-            scales.extend(own.map(|(&w, window)| (batch[w].index, window.noise_scale)));
-        }
-    }
-    scales.sort_by_key(|(index, _)| *index);
-    scales
+    noise_scales_by_place(selection).into_iter().map(|(w, scale)| (batch[w].index, scale)).collect()
 }
 
 /// κ of a window that a model does not come near, at least and in units of the usual one.
@@ -326,30 +316,46 @@ fn parts_with(batch: &[BatchWindow], selected: &Selection) -> impl Iterator<Item
 /// A parameter is clearly there whose 90 % interval stays above this share of its median.
 const CLEARLY_THERE: f64 = 0.1;
 
-/// Joints all of whose effects vanish within what the errors of the axes leave open of them: evidence is taken at
-/// the axes as they were fitted, published spreads are not.
-fn explained_by_axes(
+/// The learner with a selected model's numbers, and some of its additions, taken over; and the model.
+fn taken_over(
     workshop: &Workshop<'_>,
     batch: &[BatchWindow],
     selected: &Selection,
-) -> Result<Vec<usize>, Failure> {
-    let Workshop { learner, fit, input, rest_prior, .. } = workshop;
+    additions: &BTreeSet<Addition>,
+) -> Result<(DynamicsLearner, Hypothesis), Failure> {
+    let hypothesis = workshop.hypothesis(additions)?;
+    let x = selected.numbers.laid_out(&hypothesis, additions);
+    let prior = workshop.rest_prior.as_ref().filter(|_| additions.contains(&Addition::Bias));
+    let mut learner = workshop.learner.clone();
+    learner.adopt(&hypothesis, &x, &noise_scales(selected, batch), prior, (workshop.fit, workshop.input))?;
+    Ok((learner, hypothesis))
+}
+
+/// The learner with a selected model taken over, where it adds anything, and the effects as published.
+fn published(
+    workshop: &Workshop<'_>,
+    batch: &[BatchWindow],
+    selected: &Selection,
+) -> Result<(Option<DynamicsLearner>, Vec<EffectPosterior>), Failure> {
     if selected.rivals.is_empty() {
-        return Ok(Vec::new());
+        return Ok((None, Vec::new()));
     }
-    let hypothesis = workshop.hypothesis(&selected.additions)?;
-    let x = selected.numbers.laid_out(&hypothesis, &selected.additions);
-    let prior = rest_prior.as_ref().filter(|_| selected.additions.contains(&Addition::Bias));
-    let mut trial = (*learner).clone();
-    trial.adopt(&hypothesis, &x, &noise_scales(selected, batch), prior, (fit, input))?;
+    let (learner, hypothesis) = taken_over(workshop, batch, selected, &selected.additions)?;
+    let effects = findings::effects(&learner, &hypothesis, selected, workshop.fit);
+    Ok((Some(learner), effects))
+}
+
+/// Joints all of whose effects vanish within what the errors of the axes leave open of them: evidence is taken at
+/// the axes as they were fitted, published spreads are not.
+fn explained_by_axes(effects: &[EffectPosterior], fit: &KinematicFit) -> Vec<usize> {
     let mut clear: BTreeMap<Label, bool> = BTreeMap::new();
-    for effect in findings::effects(&trial, &hypothesis, selected, fit) {
+    for effect in effects {
         let Some(label) = effect.label else { continue };
         let is_clear = |q: &Quantity| (q.q05 / q.median).min(q.q95 / q.median) > CLEARLY_THERE;
         *clear.entry(label).or_default() |= effect.parameters.values().any(is_clear);
     }
     let vague = clear.into_iter().filter(|(_, clear)| !clear).map(|(label, _)| label);
-    Ok(vague.filter_map(|label| fit.joints.iter().position(|joint| joint.child == label)).collect())
+    vague.filter_map(|label| fit.joints.iter().position(|joint| joint.child == label)).collect()
 }
 
 /// Whether all that a model has more than another is a force over time, which says nothing of other windows.

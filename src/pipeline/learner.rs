@@ -631,9 +631,7 @@ impl Learner {
                 tree.iter()
                     .enumerate()
                     .map(|(joint, (child, parent, joint_type, _))| {
-                        self.evidence[child]
-                            .iter()
-                            .find(|o| o.parent == *parent)
+                        self.evidence_of(*child, *parent)
                             .and_then(|o| o.fits[*joint_type as usize].as_ref())
                             .map_or_else(
                                 || vec![0.0; self.windows[w].times_s.len()],

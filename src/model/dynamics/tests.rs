@@ -252,13 +252,18 @@ fn a_window_taken_for_noise_is_looked_at_again() {
     assert!(first.noise_scale < 10.0 && again.noise_scale == first.noise_scale, "{first:?} {again:?}");
 }
 
-/// Where a joint turns round, it stays a little: that is the end of its range only where something holds it.
-#[test]
-fn an_end_that_a_joint_runs_into_is_a_stop_and_one_where_it_turns_round_is_none() {
+/// A hinge, and the same with a stop at .45 rad.
+fn free_and_stopped() -> (Truth, Truth) {
     let free = Truth::single(true, 0.3, 0.4, 2.5);
     let mut bodies = vec![body(&free.joints[0], 2.5, Vector3::new(0.2, 0.0, 0.0), 0.3, 0.4)];
     bodies[0].parameters.upper = Some(Limit::at(0.45));
-    let stopped = Truth { tree: Tree::new(bodies, GRAVITY).unwrap(), ..Truth::single(true, 0.3, 0.4, 2.5) };
+    (free, Truth { tree: Tree::new(bodies, GRAVITY).unwrap(), ..Truth::single(true, 0.3, 0.4, 2.5) })
+}
+
+/// Where a joint turns round, it stays a little: that is the end of its range only where something holds it.
+#[test]
+fn an_end_that_a_joint_runs_into_is_a_stop_and_one_where_it_turns_round_is_none() {
+    let (free, stopped) = free_and_stopped();
     for (truth, stops) in [(free, [false, false]), (stopped, [false, true])] {
         let mut learner = DynamicsLearner::new(GRAVITY);
         let (window, contact, q) = truth.window(2.5, 0.7, 2.0, &mut ChaCha8Rng::seed_from_u64(5));
@@ -271,13 +276,10 @@ fn an_end_that_a_joint_runs_into_is_a_stop_and_one_where_it_turns_round_is_none(
 
 #[test]
 fn a_stop_that_a_joint_goes_beyond_was_none() {
-    let free = Truth::single(true, 0.3, 0.4, 2.5);
-    let mut bodies = vec![body(&free.joints[0], 2.5, Vector3::new(0.2, 0.0, 0.0), 0.3, 0.4)];
-    bodies[0].parameters.upper = Some(Limit::at(0.45));
-    let held = Truth { tree: Tree::new(bodies, GRAVITY).unwrap(), ..Truth::single(true, 0.3, 0.4, 2.5) };
+    let (free, stopped) = free_and_stopped();
     let mut learner = DynamicsLearner::new(GRAVITY);
     let (mut windows, mut positions, mut stops) = (Vec::new(), Vec::new(), Vec::new());
-    for truth in [&held, &free] {
+    for truth in [&stopped, &free] {
         let (window, contact, q) = truth.window(2.5, 0.7, 2.0, &mut ChaCha8Rng::seed_from_u64(5));
         windows.push(window);
         positions.push(q);

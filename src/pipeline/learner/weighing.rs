@@ -132,7 +132,7 @@ impl Learner {
         lazy: bool,
     ) -> ParentEvidence {
         let left = |joint_type: JointType| lazy && self.trails(child, parent, joint_type, OUT_OF_REACH);
-        let old = self.old_evidence(child, parent);
+        let old = self.evidence_of(child, parent);
         if let Some(old) = old.filter(|_| MOVING_TYPES.into_iter().all(left)) {
             return self.prolonged(old);
         }
@@ -167,8 +167,8 @@ impl Learner {
         option
     }
 
-    /// What was known of an edge before this window.
-    fn old_evidence(&self, child: Label, parent: Option<Label>) -> Option<&ParentEvidence> {
+    /// What is known of an edge: until all are weighed, before this window.
+    pub(super) fn evidence_of(&self, child: Label, parent: Option<Label>) -> Option<&ParentEvidence> {
         self.evidence.get(&child)?.iter().find(|option| option.parent == parent)
     }
 
@@ -177,14 +177,13 @@ impl Learner {
         let options = self.evidence.get(&child).map_or(&[][..], Vec::as_slice);
         let best = options.iter().flat_map(|option| option.log_evidence).fold(f64::NEG_INFINITY, f64::max);
         let slot = joint_type as usize;
-        self.old_evidence(child, parent)
+        self.evidence_of(child, parent)
             .is_some_and(|option| option.fits[slot].is_some() && option.log_evidence[slot] < best - by)
     }
 
     /// Turns a fit the way the one before counted: an axis's sign is free, but what was learned goes by it.
     fn keep_sign(&self, fit: &mut EdgeFit, child: Label, parent: Option<Label>) {
-        let options = self.evidence.get(&child).map_or(&[][..], Vec::as_slice);
-        let before = options.iter().find(|option| option.parent == parent);
+        let before = self.evidence_of(child, parent);
         let before = before.and_then(|option| option.fits[fit.joint.joint_type as usize].as_ref());
         if before.is_some_and(|before| before.joint.axis.direction.dot(&fit.joint.axis.direction) < 0.0) {
             fit.joint.axis.direction = -fit.joint.axis.direction;
@@ -217,7 +216,7 @@ impl Learner {
         if moved(child) || parent.is_some_and(moved) {
             return None;
         }
-        self.old_evidence(child, parent).map(|old| self.prolonged(old))
+        self.evidence_of(child, parent).map(|old| self.prolonged(old))
     }
 
     /// Evidence to which the newest window adds nothing.
@@ -241,10 +240,8 @@ impl Learner {
         motions: &BTreeMap<Label, Motion>,
     ) -> Vec<Axis> {
         let mut starts = Vec::new();
-        let known = self.evidence.get(&part.label).and_then(|options| {
-            options.iter().find(|o| o.parent == parent)?.fits[joint_type as usize].as_ref().map(|f| f.joint.axis)
-        });
-        starts.extend(known);
+        let known = self.evidence_of(part.label, parent).and_then(|o| o.fits[joint_type as usize].as_ref());
+        starts.extend(known.map(|fit| fit.joint.axis));
         if let Some((seed_parent, seed)) = motions.get(&part.label).and_then(|m| m.seed.as_ref()) {
             let seed_type = if seed.point.is_some() { JointType::Revolute } else { JointType::Prismatic };
             if *seed_parent == parent && seed_type == joint_type {
@@ -281,8 +278,7 @@ impl Learner {
     /// Log weight of a joint between a part that moved and a parent (`None`: what never moved): the evidence
     /// summed over joint types, and what the gap between them says beforehand; −∞ where there is none.
     pub(in crate::pipeline) fn log_edge_weight(&self, child: Label, parent: Option<Label>) -> f64 {
-        let options = self.evidence.get(&child).map_or(&[][..], Vec::as_slice);
-        let option = options.iter().find(|option| option.parent == parent);
+        let option = self.evidence_of(child, parent);
         option.map_or(f64::NEG_INFINITY, |o| log_sum_exp(&o.log_evidence) + self.log_contact_prior(child, parent))
     }
 
@@ -328,8 +324,8 @@ impl Learner {
             .filter_map(|node| {
                 let child = movers[node - 1];
                 let parent = tree.parent(node).and_then(|p| p.checked_sub(1)).map(|p| movers[p]);
-                let option = self.evidence[&child].iter().find(|o| o.parent == parent)?;
-                let fits = [JointType::Prismatic, JointType::Revolute].map(|t| option.fits[t as usize].as_ref());
+                let option = self.evidence_of(child, parent)?;
+                let fits = MOVING_TYPES.map(|t| option.fits[t as usize].as_ref());
                 let fit = fits.into_iter().flatten().max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence))?;
                 Some((child, parent, fit.joint.joint_type, fit.joint.axis))
             })
