@@ -186,7 +186,7 @@ impl Learner {
         for joint in &joints {
             let start = self.displacements.get(&joint.child).copied().unwrap_or_else(Pose::identity);
             let seen = poses.entry(joint.child).or_insert_with(|| {
-                let measured = |(k, frame): (usize, &super::explain::Frame)| {
+                let measured = |(k, frame): (usize, &super::Frame)| {
                     let expected = motions.get(&joint.child).map_or(start, |motion| motion.displacements[k]);
                     measure(self.models.get(&joint.child)?, frame.scans.get(&joint.child)?, &expected, &settings)
                 };

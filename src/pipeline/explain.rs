@@ -6,17 +6,16 @@
 //! explained becomes a possible parent for the others.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Arc;
 
 use nalgebra::{Matrix6, Vector3, Vector6};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::poses::SeenPose;
+use super::frame::Frame;
 use crate::math::{Pose, Screw};
 use crate::mechanism::JointType;
 use crate::model::{
-    Axis, Contact, KinematicJoint, KinematicSettings, PoseMeasurement, WindowObservations, fit_kinematics,
+    Axis, Contact, KinematicJoint, KinematicSettings, PoseMeasurement, SharedByFits, WindowObservations, fit_edge,
 };
 use crate::registration::{
     AlignmentSettings, AxisSeed, JointFrame, JointPath, OUTLIER_COST, PartModel, Quadratic, ScanPoint, fit_circle,
@@ -35,6 +34,8 @@ const WRONG_LABELS: f64 = 0.1;
 const EVERY_RAY: usize = 3;
 /// A tool track explained to this root mean square is explained \[m\].
 const TOOL_EXPLAINED: f64 = 0.003;
+/// Beyond this many times that a track is not explained; in between it is in part.
+const TOOL_FELT: f64 = 1.5;
 /// Excess at which a part that was taken for the root is looked at like the others.
 const LEFT: f64 = 0.6;
 /// Share of the largest eigenvalue of a factor that rough normals may pretend to hold.
@@ -57,19 +58,6 @@ const LEAST_TURN: f64 = 0.08;
 const LEAST_SHIFT: f64 = 0.010;
 /// Scans with fewer points say nothing of a pose.
 pub const FEWEST_POINTS: usize = 25;
-
-/// The clouds of one stamp, by part.
-#[derive(Clone, Debug, Default)]
-pub struct Frame {
-    /// Seconds since time zero.
-    pub time_s: f64,
-    /// Each part's points, shared by all who keep the frame.
-    pub scans: Arc<BTreeMap<Label, Vec<ScanPoint>>>,
-    /// The parts whose pose a topic measures; they have no scans.
-    pub poses: BTreeMap<Label, SeenPose>,
-    /// Whether one of these moves.
-    pub moves: bool,
-}
 
 /// What a part's scans cost where its pose is known.
 #[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
@@ -119,8 +107,8 @@ pub struct Motion {
     pub excess: f64,
     /// The new joint that explains it, with the parent it was found against.
     pub seed: Option<(Option<Label>, AxisSeed)>,
-    /// Whether it is explained: seen or felt to be there, or clearly not; `None`: in between.
-    pub explained: Option<bool>,
+    /// By how much it is explained, 0 to 1: seen or felt to be there, or clearly not; `None`: that is open.
+    pub explained: Option<f64>,
     /// The part that it was explained against; `None`: the world.
     pub carrier: Option<Label>,
     /// Excess, misses of the tool and complexity: the least is taken.
@@ -130,7 +118,7 @@ pub struct Motion {
 impl Motion {
     /// A motion that was measured, and needs no explanation.
     pub fn measured(displacements: Vec<Pose>, moved: bool) -> Self {
-        Self { displacements, moved, excess: 0.0, seed: None, explained: Some(true), carrier: None, score: 0.0 }
+        Self { displacements, moved, excess: 0.0, seed: None, explained: Some(1.0), carrier: None, score: 0.0 }
     }
 }
 
@@ -211,7 +199,8 @@ fn explain_window(scene: &Scene<'_>, measured: &BTreeMap<Label, Motion>) -> BTre
     let unknown: Vec<Label> = scene.models.keys().copied().filter(|l| !motions.contains_key(l)).collect();
     for label in unknown.into_iter().filter(|&label| Some(label) != scene.root) {
         let still = scene.evaluate(label, |_| scene.start_of(label));
-        if still.excess < EXPLAINED && scene.tool_miss(label, &still.displacements) < TOOL_EXPLAINED {
+        let rests = still.excess < EXPLAINED && scene.tool_miss(label, &still.displacements) < TOOL_EXPLAINED;
+        if rests && !scene.pushed_unseen(label) {
             motions.insert(label, still);
         } else {
             open.push(label);
@@ -353,23 +342,30 @@ impl<'a> Scene<'a> {
         ((share - WRONG_LABELS) / (1.0 - WRONG_LABELS)).max(0.0)
     }
 
+    /// Whether a part that moved before is touched by a tool whose track tells nothing: a narrow part looks much the
+    /// same wherever its joint has it, so rest is no better an account of it than its joint.
+    fn pushed_unseen(&self, label: Label) -> bool {
+        let known = self.touched_before.contains(&label) && self.joints.iter().any(|joint| joint.child == label);
+        known && !self.use_tool && self.contacts.iter().any(|contact| contact.label == label)
+    }
+
     /// Root mean square by which the tool misses a contact point that is fixed on the part \[m\].
     fn tool_miss(&self, label: Label, displacements: &[Pose]) -> f64 {
         self.contact(label).map_or(0.0, |contact| miss_of(contact, displacements))
     }
 
-    /// Whether a motion explains what was seen and felt of a part: new faces leave a high excess, so what
-    /// the tool goes along with counts as well.
-    fn explains(&self, label: Label, motion: &Motion) -> Option<bool> {
-        let held = self.contact(label).is_some() && motion.moved;
-        let felt = held && self.tool_miss(label, &motion.displacements) < TOOL_EXPLAINED;
-        if motion.excess < WELL_EXPLAINED || felt {
-            Some(true)
-        } else {
-            // Parts that open next to it change what is seen of a part at rest.
-            let most = if motion.moved { BADLY_EXPLAINED } else { 2.0 * BADLY_EXPLAINED };
-            (motion.excess > most).then_some(false)
+    /// By how much, 0 to 1, a motion explains what was seen and felt of a part: new faces leave a high excess, so
+    /// what the tool goes along with counts as well. `None` where that is open.
+    fn explains(&self, label: Label, motion: &Motion) -> Option<f64> {
+        if motion.excess < WELL_EXPLAINED {
+            return Some(1.0);
         }
+        let held = self.contact(label).is_some() && motion.moved;
+        let miss = self.tool_miss(label, &motion.displacements);
+        let felt = if held { (2.0 * (TOOL_FELT - miss / TOOL_EXPLAINED)).clamp(0.0, 1.0) } else { 0.0 };
+        // Parts that open next to it change what is seen of a part at rest.
+        let most = if motion.moved { BADLY_EXPLAINED } else { 2.0 * BADLY_EXPLAINED };
+        (felt == 1.0 || motion.excess > most).then_some(felt)
     }
 
     /// Whether a motion explains a part clearly better than rest. A cost that stays high either way
@@ -377,7 +373,8 @@ impl<'a> Scene<'a> {
     fn beats(&self, label: Label, motion: &Motion, still: &Motion) -> bool {
         let gain = still.excess - motion.excess;
         let share = if self.contacts.iter().any(|c| c.label == label) { 0.3 } else { 0.5 };
-        let seen = gain > EXPLAINED && gain > share * still.excess;
+        let by_its_joint = motion.seed.is_none() && self.pushed_unseen(label);
+        let seen = gain > if by_its_joint { RECONSIDERED } else { EXPLAINED } && gain > share * still.excess;
         let miss = self.tool_miss(label, &still.displacements);
         let felt = miss > TOOL_EXPLAINED
             && self.tool_miss(label, &motion.displacements) < 0.5 * miss
@@ -533,12 +530,14 @@ impl<'a> Scene<'a> {
 
     /// Explains a part again where all others are explained.
     fn reconsider(&self, label: Label, motions: &mut BTreeMap<Label, Motion>, offers: &mut Offers) {
-        if motions[&label].excess < EXPLAINED && motions[&label].seed.is_none() {
+        // A free track costs least and tells no joint: it stands only where no joint on any of the others does.
+        let free = self.free.get(&label) == Some(&motions[&label].displacements);
+        if motions[&label].excess < EXPLAINED && motions[&label].seed.is_none() && !free {
             return;
         }
         self.prepare(&[label], motions, offers);
         let Some(motion) = self.best_motion(label, motions, offers) else { return };
-        if motion.score < motions[&label].score - RECONSIDERED {
+        if free || motion.score < motions[&label].score - RECONSIDERED {
             let motion = self.accepted(label, motion);
             motions.insert(label, motion);
             offers.refined.retain(|(_, parent), _| *parent != Some(label));
@@ -704,7 +703,7 @@ impl<'a> Scene<'a> {
                 contacts,
                 ..WindowObservations::default()
             };
-            let fit = fit_kinematics(vec![joint], vec![vec![positions]], &[&window], &settings);
+            let fit = fit_edge(joint, vec![vec![positions]], &[&window], &settings, &SharedByFits::default());
             joint = fit.joints[0];
             positions = fit.positions.into_iter().next()?.into_iter().next()?;
         }

@@ -5,6 +5,7 @@ mod evaluate;
 mod explain;
 mod first_look;
 mod forecast;
+mod frame;
 mod grip;
 mod keyframes;
 mod learner;
@@ -26,8 +27,8 @@ use std::sync::Arc;
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
 pub use evaluate::{PartScore, ResidualSample, Scores, StageScore};
-pub use explain::Frame;
 pub use first_look::FirstLook;
+pub use frame::Frame;
 pub use learner::{Learner, ParentEvidence, WindowJob};
 pub use planning::Planner;
 pub use poses::PoseSettings;
@@ -45,7 +46,7 @@ use evaluate::Scoring;
 use explain::{FEWEST_POINTS, measurement_of, travel};
 use first_look::REFERENCE_FRAMES;
 use forecast::Forecaster;
-use poses::{POSED_RADIUS, PoseBuffer, PosedPart, RECORD_GAP};
+use poses::{PoseBuffer, PosedPart, RECORD_GAP};
 use saved::Resumed;
 use windows::{CutWindow, frame_of};
 use worker::Begin;
@@ -424,7 +425,7 @@ impl Pipeline {
             return vec![Output::WindowClosed(Box::new(ClosedWindow::new(self.closed_windows, window, begin)))];
         }
         let Some(learner) = self.learner.as_mut() else { return Vec::new() };
-        let job = window.job(nearest_label);
+        let job = window.job();
         if let Some(scoring) = &mut self.scoring {
             let learner = Arc::make_mut(learner);
             scoring.score(learner, &job);
@@ -543,22 +544,4 @@ impl Pipeline {
             travel(model, old, new) > 0.006 && cost(old) - cost(new) > MOVING_COST
         })
     }
-}
-
-/// The part whose points are nearest to a place, by majority of the nearest few.
-fn nearest_label(place: &Vector3<f64>, frame: &Frame) -> Option<Label> {
-    frame
-        .scans
-        .iter()
-        .filter_map(|(label, scan)| {
-            let mut distances: Vec<f64> = scan.iter().map(|p| (p.point_in_world - place).norm()).collect();
-            let rank = 3.min(distances.len().checked_sub(1)?);
-            distances.select_nth_unstable_by(rank, f64::total_cmp);
-            Some((distances[rank], *label))
-        })
-        .chain(frame.poses.iter().map(|(label, seen)| {
-            (((seen.world_from_frame.translation - place).norm() - POSED_RADIUS).max(0.0), *label)
-        }))
-        .min_by(|a, b| a.0.total_cmp(&b.0))
-        .map(|(_, label)| label)
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::Vector3;
 
-use super::{Frame, Pipeline, nearest_label};
+use super::{Frame, Pipeline};
 use crate::math::Pose;
 use crate::tracking::{Filter, FreePart, Plan, PlannedPose};
 use crate::types::Label;
@@ -35,7 +35,7 @@ impl Planner {
 
     /// The part whose surface is nearest to a point in world.
     pub fn nearest(&self, point_in_world: &Vector3<f64>) -> Option<Label> {
-        nearest_label(&self.world_from_work.inverse().transform_point(point_in_world), &self.frame)
+        Some(self.frame.nearest(&self.world_from_work.inverse().transform_point(point_in_world))?.0)
     }
 
     /// Every part at the times of a plan, all in world; `None` if it acts on a part without a joint.

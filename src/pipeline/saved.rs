@@ -10,7 +10,8 @@ use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use super::explain::{FEWEST_POINTS, Frame, grid_of};
+use super::Frame;
+use super::explain::{FEWEST_POINTS, grid_of};
 use super::poses::{POSED_RADIUS, PosedPart};
 use super::working_frame::WorkingFrame;
 use super::{Learner, Output, Pipeline, PipelineSettings};

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use nalgebra::Vector3;
 
+use super::Frame;
 use super::rest::RestReading;
-use super::{Frame, nearest_label};
 use crate::mechanism::WrenchSample;
 use crate::types::Label;
 
@@ -121,7 +121,7 @@ impl Toucher {
         self.looked_s = frame.time_s;
         let mut touches = Vec::new();
         let tool_now = (end > first).then(|| samples[end - 1].point_in_world);
-        let nearest = self.bound.or_else(|| nearest_label(&tool_now?, frame));
+        let nearest = self.bound.or_else(|| Some(frame.nearest(&tool_now?)?.0));
         self.nearest = tool_now.and_then(|tool| {
             let label = nearest?;
             let points = frame.scans.get(&label)?.iter().map(|p| p.point_in_world);

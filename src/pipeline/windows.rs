@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
-use super::explain::Frame;
+use super::Frame;
 use super::learner::WindowJob;
 use super::rest::RestReading;
 use crate::model::Contact;
@@ -177,9 +177,10 @@ impl WindowCutter {
         // What is let go may move on by itself while the tool goes to take hold anew: two contacts, two windows.
         let silent = now - self.last_contact_s > self.readings.settings.quiet_s;
         if !active && let Some((label, distance)) = self.touched {
-            self.left |= self.readings.distance(&frame, label).is_some_and(|now| now > distance + LEAVES);
+            let now = self.readings.tool(&frame).and_then(|tool| frame.distance(&tool, label));
+            self.left |= now.is_some_and(|now| now > distance + LEAVES);
         }
-        let touched = if active { self.readings.touched(&frame) } else { None };
+        let touched = if active { self.readings.tool(&frame).and_then(|tool| frame.nearest(&tool)) } else { None };
         let another = touched.zip(self.touched).is_some_and(|((label, _), (before, _))| label != before);
         let let_go = (active && silent && (another || self.left) && self.is_open()).then(|| self.close(previous));
         if active {
@@ -298,9 +299,9 @@ impl CutWindow {
         (time(self.frames.first()), time(self.frames.last()))
     }
 
-    /// The window with the tools' contacts, by which parts are `nearest` to them.
-    pub fn job(self, nearest: impl Fn(&Vector3<f64>, &Frame) -> Option<Label>) -> WindowJob {
-        let contacts = self.readings.contacts(&self.frames, nearest);
+    /// The window with the tools' contacts, each with the part nearest to it.
+    pub fn job(self) -> WindowJob {
+        let contacts = self.readings.contacts(&self.frames);
         let Readings { wrenches, zero, .. } = self.readings;
         WindowJob { frames: self.frames, contacts, wrenches: wrenches.into(), zero }
     }
@@ -340,17 +341,10 @@ impl Readings {
         })
     }
 
-    /// The part whose points are nearest to the tool, and how near \[m\].
-    fn touched(&self, frame: &Frame) -> Option<(Label, f64)> {
-        let distances = frame.scans.keys().filter_map(|label| Some((*label, self.distance(frame, *label)?)));
-        distances.min_by(|a, b| a.1.total_cmp(&b.1))
-    }
-
-    /// From the tool to the nearest point of a part \[m\].
-    fn distance(&self, frame: &Frame, label: Label) -> Option<f64> {
-        let tool = self.wrenches.iter().rev().find(|w| w.tool && self.time(w) <= frame.time_s)?.point_in_world;
-        let scan = frame.scans.get(&label)?.iter();
-        scan.map(|point| (point.point_in_world - tool).norm()).min_by(f64::total_cmp)
+    /// Where the tool is at a frame's stamp, as it was last heard of \[m\].
+    fn tool(&self, frame: &Frame) -> Option<Vector3<f64>> {
+        let heard = self.wrenches.iter().rev().find(|w| w.tool && self.time(w) <= frame.time_s)?;
+        Some(heard.point_in_world)
     }
 
     /// Whether the noise of every tool's readings is known.
@@ -373,17 +367,12 @@ impl Readings {
     }
 
     /// Each tool's contact, by the part that it was nearest to.
-    fn contacts(&self, frames: &[Frame], nearest: impl Fn(&Vector3<f64>, &Frame) -> Option<Label>) -> Vec<Contact> {
+    fn contacts(&self, frames: &[Frame]) -> Vec<Contact> {
         let tools: BTreeSet<usize> = self.wrenches.iter().filter(|w| w.tool).map(|w| w.source).collect();
-        tools.into_iter().filter_map(|source| self.contact_of(source, frames, &nearest)).collect()
+        tools.into_iter().filter_map(|source| self.contact_of(source, frames)).collect()
     }
 
-    fn contact_of(
-        &self,
-        source: usize,
-        frames: &[Frame],
-        nearest: impl Fn(&Vector3<f64>, &Frame) -> Option<Label>,
-    ) -> Option<Contact> {
+    fn contact_of(&self, source: usize, frames: &[Frame]) -> Option<Contact> {
         let active: Vec<bool> = frames.iter().map(|f| self.active_at(f.time_s, Some(source))).collect();
         let (first, last) = (active.iter().position(|a| *a)?, active.iter().rposition(|a| *a)?);
         let mut track = Vec::new();
@@ -392,7 +381,7 @@ impl Readings {
             if let Some((position, sigma)) = self.tool_at(source, frames[k].time_s) {
                 track.push((k, position, sigma));
                 if active[k]
-                    && let Some(label) = nearest(&position, &frames[k])
+                    && let Some((label, _)) = frames[k].nearest(&position)
                 {
                     *votes.entry(label).or_default() += 1;
                 }
@@ -488,8 +477,7 @@ mod tests {
             }
         }
         windows.extend(cutter.flush());
-        let label = |x: &Vector3<f64>, _: &Frame| Some(Label(if x.x < 0.5 { 1 } else { 2 }));
-        let jobs: Vec<WindowJob> = windows.into_iter().map(|window| window.job(label)).collect();
+        let jobs: Vec<WindowJob> = windows.into_iter().map(CutWindow::job).collect();
         let touched = jobs.iter().map(|job| job.contacts.iter().map(|c| c.label).collect()).collect();
         let moved = jobs[0].contacts[0].track.iter().map(|(_, tool, _)| tool.x).fold(0.0, f64::max);
         (touched, moved)

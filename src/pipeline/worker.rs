@@ -9,7 +9,7 @@ use std::sync::Arc;
 use super::forecast::mechanism_of;
 use super::windows::CutWindow;
 use super::working_frame::hulls;
-use super::{FirstLook, Learner, nearest_label};
+use super::{FirstLook, Learner};
 use crate::geometry::HullProperties;
 use crate::math::Pose;
 use crate::tracking::TrackedMechanism;
@@ -116,7 +116,7 @@ impl Worker {
         });
         let span_s = window.span_s();
         // The stream goes on with the one before meanwhile.
-        Arc::make_mut(learner).learn(&window.window.job(nearest_label));
+        Arc::make_mut(learner).learn(&window.window.job());
         Learned {
             sequence: window.sequence,
             mechanism: mechanism_of(learner),
