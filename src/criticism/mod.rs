@@ -74,11 +74,18 @@ impl Critic {
         self.findings.clone().unwrap_or_else(Criticism::insufficient)
     }
 
+    /// After a review that failed: what was found before stands, but not that it was enough.
+    pub fn note_failure(&mut self) {
+        if let Some(findings) = self.findings.as_mut().filter(|findings| findings.verdict == Verdict::Adequate) {
+            findings.verdict = Verdict::Unexplained;
+        }
+    }
+
     /// Looks at all windows so far; effects that they call for are in the learner's model after it.
     /// Returns the linearizations spent.
     ///
     /// # Errors
-    /// Where no hypothesis could be fitted: the findings are then as before.
+    /// Where no hypothesis could be fitted: the findings are then as before; see [`Critic::note_failure`].
     pub fn review(
         &mut self,
         learner: &mut DynamicsLearner,
@@ -403,4 +410,23 @@ fn confirmed(
         selected = selector.restored(selected, base, &refuted, sensor)?;
     }
     Ok((selected, before.clone()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_review_that_failed_calls_nothing_adequate() {
+        for (before, after) in [
+            (Verdict::Adequate, Verdict::Unexplained),
+            (Verdict::EffectFound, Verdict::EffectFound),
+            (Verdict::Insufficient, Verdict::Insufficient),
+        ] {
+            let findings = Criticism { verdict: before, ..Criticism::insufficient() };
+            let mut critic = Critic { findings: Some(findings), ..Critic::default() };
+            critic.note_failure();
+            assert_eq!(critic.findings().verdict, after);
+        }
+    }
 }

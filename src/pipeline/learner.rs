@@ -11,7 +11,8 @@ use serde::{Deserialize, Serialize};
 
 pub use weighing::ParentEvidence;
 
-use super::explain::{Baseline, Frame, Motion, Scene, explain_contacts, measure_faces, rays_past, travel};
+use super::Frame;
+use super::explain::{Baseline, Motion, Scene, explain_contacts, measure_faces, rays_past, travel};
 use super::keyframes::Keyframes;
 use super::poses::{POSED_RADIUS, PosedPart, measured_motion};
 use crate::criticism::Critic;
@@ -70,7 +71,7 @@ impl WindowJob {
     }
 }
 
-/// In how many windows a part's motion was explained, and in how many it was not.
+/// In how many windows a part's motion was explained, and in how many it was not; some in part.
 #[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 struct Explained {
     well: f64,
@@ -361,10 +362,10 @@ impl Learner {
             // What goes along with another part says nothing of its own joint.
             let rides = self.rides(*label, motion, &motions);
             let explained = self.explained.entry(*label).or_default();
-            match motion.explained {
-                Some(true) if motion.moved && !rides => explained.well += 1.0,
-                Some(false) => explained.badly += 1.0,
-                _ => {}
+            let Some(share) = motion.explained else { continue };
+            explained.badly += 1.0 - share;
+            if motion.moved && !rides {
+                explained.well += share;
             }
         }
         let observations = WindowObservations {
@@ -457,7 +458,10 @@ impl Learner {
         let mut inference = self.dynamics.learn_window(fit, &input);
         match self.critic.review(&mut self.dynamics, fit, &input) {
             Ok(steps) => inference.steps += steps,
-            Err(failure) => tracing::debug!(%failure, "no review"),
+            Err(failure) => {
+                tracing::info!(%failure, "no physics could be fitted to all windows: they are not called adequate");
+                self.critic.note_failure();
+            }
         }
         self.inferences.push(inference);
     }

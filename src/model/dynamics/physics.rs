@@ -3,7 +3,9 @@
 use nalgebra::DMatrix;
 
 use super::batch::{BatchWindow, Hypothesis};
-use super::layout::{AddedEffect, JointModel, JointScales, LOWER, Mechanism, SENSOR_SIZE, SIZE, UPPER};
+use super::layout::{
+    AddedEffect, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism, SENSOR_SIZE, SIZE, UPPER,
+};
 use super::learner::{
     Block, DynamicsInput, DynamicsLearner, Site, Warm, added_effect, extended, kinematics_of, standard_sensor,
     travel_of,
@@ -14,6 +16,9 @@ use crate::math::median;
 use crate::mechanism::effects::EffectKind;
 use crate::model::KinematicFit;
 use crate::types::Label;
+
+/// A stop of which more than this share of the first spread is left is told of by no window.
+const UNTOLD: f64 = 0.9;
 
 impl DynamicsLearner {
     /// The windows in which joints move, in joint space; of those that move the same joints the last `most`.
@@ -193,7 +198,26 @@ impl DynamicsLearner {
                 Err(_) => self.windows[window].learned = false,
             }
         }
-        Ok(())
+        self.drop_untold_stops(fit)
+    }
+
+    /// A stop that no window says anything of any more was believed for what the model lacked then.
+    fn drop_untold_stops(&mut self, fit: &KinematicFit) -> Result<(), Failure> {
+        let (_, covariance) = self.belief.product(None).moments(&self.blocks())?;
+        let mut dropped = false;
+        for (k, model) in self.mechanism.joints.iter().enumerate() {
+            let Some(memory) = self.joints.get_mut(&model.joint.child) else { continue };
+            for (side, place) in [LOWER, UPPER].into_iter().enumerate().filter(|(side, _)| model.stops[*side]) {
+                let place = self.mechanism.offset(k) + place;
+                if covariance[(place, place)].sqrt() > UNTOLD * LIMIT_DEVIATION {
+                    tracing::debug!(label = %model.joint.child, side, "nothing tells of an end stop any more");
+                    memory.stops[side] = false;
+                    memory.stop_positions[side] = 0.0;
+                    dropped = true;
+                }
+            }
+        }
+        if dropped { self.rebuild(fit) } else { Ok(()) }
     }
 
     /// Covariance of some numbers of the model as it is believed now, kinematic errors included.

@@ -16,6 +16,9 @@ use crate::types::posterior::{InformedBy, Quantity};
 /// is watched: on the generator's well-excited doors inertias were off by .7 % to 1.2 % with stated
 /// spreads a third of that.
 pub(super) const MODEL_FLOOR: f64 = 0.012;
+/// End stops are where the reference configuration has them, and where that is registration says: no stop is known
+/// better, however hard it was hit \[m\].
+const REFERENCE_ERROR: f64 = 0.001;
 
 /// Of one joint.
 #[derive(Clone, Debug, PartialEq)]
@@ -95,10 +98,11 @@ impl DynamicsLearner {
                     informed(entry, deviation(entry)),
                 )
             };
+            let floor = if revolute { REFERENCE_ERROR / model.joint.radius } else { REFERENCE_ERROR };
             let stop = |side: usize, entry: usize| {
-                model.stops[side].then(|| {
-                    Quantity::from_normal(units[3], posterior.mean[at + entry], deviation(entry), InformedBy::Dynamics)
-                })
+                let place = posterior.mean[at + entry];
+                let deviation = deviation(entry).hypot(floor);
+                model.stops[side].then(|| Quantity::from_normal(units[3], place, deviation, InformedBy::Dynamics))
             };
             let (mean, covariance) = (&posterior.mean, &posterior.covariance);
             let (inertia, inertia_deviation) = self.log_of(mean, covariance, |tree| tree.joint_inertia(k))?;

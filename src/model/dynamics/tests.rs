@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 use super::innovations::WindowModel;
-use super::layout::{DAMPING, FRICTION, INERTIA};
+use super::layout::{DAMPING, FRICTION, INERTIA, LIMIT_DEVIATION, UPPER};
 use super::layout::{JointScales, Mechanism, SIZE, SensorModel, joint_models};
 use super::learner::{DynamicsInput, DynamicsLearner};
 use super::posterior::DynamicsPosterior;
@@ -290,6 +290,29 @@ fn a_stop_that_a_joint_goes_beyond_was_none() {
         stops.push(learner.mechanism().joints[0].stops);
     }
     assert_eq!(stops, [[false, true], [false, false]]);
+}
+
+#[test]
+fn a_stop_of_which_no_window_tells_is_dropped_when_a_model_is_taken_over() {
+    let (free, stopped) = free_and_stopped();
+    for (truth, stops) in [(&stopped, [false, true]), (&free, [false, false])] {
+        let mut learner = DynamicsLearner::new(GRAVITY);
+        let (window, contact, q) = truth.window(2.5, 0.7, 2.0, &mut ChaCha8Rng::seed_from_u64(5));
+        let (contacts, positions, windows) = (&[contact], [q], &[&window]);
+        let input = DynamicsInput { windows, contacts, zero: Stamp(0), parts: &truth.hulls, use_tool: true };
+        let fit = truth.fit(&positions);
+        learner.learn_window(&fit, &input);
+        // A stop at .45 rad, or beyond all that the joint did.
+        let mut mechanism = learner.declared_mechanism();
+        mechanism.joints[0].stops = [false, true];
+        let mut hypothesis = learner.hypothesis(mechanism, None).unwrap();
+        let end = if stops[1] { 0.45 } else { 3.0 };
+        hypothesis.prior.precision[(UPPER, UPPER)] = LIMIT_DEVIATION.powi(-2);
+        hypothesis.prior.information[UPPER] = end * LIMIT_DEVIATION.powi(-2);
+        let x: Vec<f64> = hypothesis.prior.moments().unwrap().0.iter().copied().collect();
+        learner.adopt(&hypothesis, &x, &[], None, (&fit, &input)).unwrap();
+        assert_eq!(learner.mechanism().joints[0].stops, stops);
+    }
 }
 
 #[test]
