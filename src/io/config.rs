@@ -165,6 +165,7 @@ impl Config {
             ("poses.rate_hz", self.poses.rate_hz),
             ("kinematics.tool_offset_sigma", self.kinematics.tool_offset_sigma),
             ("kinematics.shared_error", self.kinematics.shared_error),
+            ("kinematics.own_error", self.kinematics.own_error),
             ("kinematics.shared_distance", self.kinematics.shared_distance),
             ("kinematics.view_error", self.kinematics.view_error),
             ("kinematics.view_distance", self.kinematics.view_distance),

@@ -70,6 +70,13 @@ pub struct Contact {
     pub track: Vec<(usize, Vector3<f64>, f64)>,
 }
 
+impl Contact {
+    /// The tool's position in a frame \[m\].
+    pub fn position(&self, frame: usize) -> Option<Vector3<f64>> {
+        self.track.iter().find(|(k, _, _)| *k == frame).map(|(_, x, _)| *x)
+    }
+}
+
 /// One window's measurements, on the grid of its cloud stamps.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct WindowObservations {

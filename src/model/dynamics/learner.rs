@@ -110,6 +110,14 @@ pub(super) struct JointMemory {
     pub(super) reached: Option<(f64, f64)>,
 }
 
+impl JointMemory {
+    /// Where the stop of a side is expected \[m or rad\], `None` where there is none.
+    pub(super) fn set_stop(&mut self, side: usize, position: Option<f64>) {
+        self.stops[side] = position.is_some();
+        self.stop_positions[side] = position.unwrap_or(0.0);
+    }
+}
+
 /// What stays of a window.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub(super) struct WindowMemory {
@@ -588,8 +596,7 @@ impl DynamicsLearner {
             let label = fit.joints[joint].child;
             let before = self.joints.get(&label).cloned();
             if let Some(memory) = self.joints.get_mut(&label) {
-                memory.stops[side] = stop.is_some();
-                memory.stop_positions[side] = stop.unwrap_or(0.0);
+                memory.set_stop(side, stop);
             }
             self.rebuild(fit)?;
             // What a stop explains is no noise any more.
@@ -666,8 +673,7 @@ impl DynamicsLearner {
             for (side, beyond) in [lower - low, high - upper].into_iter().enumerate() {
                 if memory.stops[side] && beyond > PASSED {
                     tracing::debug!(label = %joint.child, side, beyond, "end stop passed");
-                    memory.stops[side] = false;
-                    memory.stop_positions[side] = 0.0;
+                    memory.set_stop(side, None);
                     passed.push(joint.child);
                 }
             }

@@ -163,12 +163,10 @@ impl DynamicsLearner {
                 memory.friction = model.friction;
                 memory.effects.clone_from(&model.effects);
                 memory.tables.clone_from(&model.tables);
-                memory.stops = model.stops;
-                let offset = hypothesis.mechanism.offset(k);
-                for (side, place) in [LOWER, UPPER].into_iter().enumerate().filter(|(side, _)| model.stops[*side]) {
-                    let place = offset + place;
-                    let prior = &hypothesis.prior;
-                    memory.stop_positions[side] = prior.information[place] / prior.precision[(place, place)];
+                for (side, place) in [LOWER, UPPER].into_iter().enumerate() {
+                    let place = hypothesis.mechanism.offset(k) + place;
+                    let expected = hypothesis.prior.information[place] / hypothesis.prior.precision[(place, place)];
+                    memory.set_stop(side, model.stops[side].then_some(expected));
                 }
             }
         }
@@ -211,8 +209,7 @@ impl DynamicsLearner {
                 let place = self.mechanism.offset(k) + place;
                 if covariance[(place, place)].sqrt() > UNTOLD * LIMIT_DEVIATION {
                     tracing::debug!(label = %model.joint.child, side, "nothing tells of an end stop any more");
-                    memory.stops[side] = false;
-                    memory.stop_positions[side] = 0.0;
+                    memory.set_stop(side, None);
                     dropped = true;
                 }
             }

@@ -57,6 +57,12 @@ impl ParentEvidence {
             _ => rigid,
         })
     }
+
+    /// The fit of the likelier moving type, by the windows gone by too.
+    fn likeliest_fit(&self) -> Option<&EdgeFit> {
+        let evidence = |fit: &EdgeFit| self.past[fit.joint.joint_type as usize] + fit.log_evidence;
+        self.fits.iter().flatten().max_by(|a, b| evidence(a).total_cmp(&evidence(b)))
+    }
 }
 
 impl Learner {
@@ -324,9 +330,7 @@ impl Learner {
             .filter_map(|node| {
                 let child = movers[node - 1];
                 let parent = tree.parent(node).and_then(|p| p.checked_sub(1)).map(|p| movers[p]);
-                let option = self.evidence_of(child, parent)?;
-                let fits = MOVING_TYPES.map(|t| option.fits[t as usize].as_ref());
-                let fit = fits.into_iter().flatten().max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence))?;
+                let fit = self.evidence_of(child, parent)?.likeliest_fit()?;
                 Some((child, parent, fit.joint.joint_type, fit.joint.axis))
             })
             .collect()
@@ -345,4 +349,38 @@ fn same_axis(first: &Axis, second: &Axis, center: &Vector3<f64>, joint_type: Joi
     let abreast = |axis: &Axis| axis.point + axis.direction * axis.direction.dot(&(center - axis.point));
     let near = joint_type == JointType::Prismatic || (abreast(first) - abreast(second)).norm() < 0.015;
     near && first.direction.cross(&second.direction).norm() < 0.05
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::KinematicJoint;
+
+    #[test]
+    fn windows_gone_by_decide_between_types_too() {
+        let axis = Axis { direction: Vector3::z(), point: Vector3::zeros() };
+        let fit = |joint_type, log_evidence| {
+            let center = Vector3::zeros();
+            let joint = KinematicJoint {
+                parent: None,
+                child: Label(1),
+                joint_type,
+                axis,
+                center,
+                radius: 0.1,
+                suggested: None,
+            };
+            Some(EdgeFit { log_evidence, joint, positions: Vec::new(), by_window: Vec::new() })
+        };
+        let option = |past| ParentEvidence {
+            parent: None,
+            log_evidence: [-900.0, -50.0, -170.0],
+            fits: [None, fit(JointType::Prismatic, -50.0), fit(JointType::Revolute, -170.0)],
+            rigid_by_window: Vec::new(),
+            past,
+        };
+        let likeliest = |past| option(past).likeliest_fit().map(|fit| fit.joint.joint_type);
+        assert_eq!(likeliest([0.0; 3]), Some(JointType::Prismatic));
+        assert_eq!(likeliest([-1100.0, -1000.0, -80.0]), Some(JointType::Revolute));
+    }
 }
