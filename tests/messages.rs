@@ -85,6 +85,7 @@ fn types() -> Vec<(&'static str, Reader)> {
         bayesian_object_models/srv/Predict_Response => own::PredictResponse,
         bayesian_object_models/srv/SaveModel_Request => own::SaveModelRequest,
         bayesian_object_models/srv/SaveModel_Response => own::SaveModelResponse,
+        bond/msg/Status => own::BondStatus,
         builtin_interfaces/msg/Time => builtin_interfaces::msg::Time,
         diagnostic_msgs/msg/DiagnosticArray => diagnostic_msgs::msg::DiagnosticArray,
         geometry_msgs/msg/PoseWithCovarianceStamped => input::PoseWithCovarianceStamped,

@@ -6,12 +6,10 @@ use std::time::Duration;
 use ros2_interfaces_jazzy_serde::diagnostic_msgs::msg::{DiagnosticArray, DiagnosticStatus, KeyValue};
 use tracing::{info, warn};
 
-use super::health::{Health, Limits, now};
+use super::health::{Health, Limits, now, wall_time};
 use super::publications::Publication;
 use super::services::Managed;
 use crate::io::counters::ByReason;
-use crate::io::messages::Time;
-use crate::types::Stamp;
 
 /// How often the node looks after itself.
 const LOOK_EVERY: Duration = Duration::from_millis(200);
@@ -81,15 +79,8 @@ fn report(node: &str, health: &Health, complaints: &BTreeMap<String, String>) ->
         ],
         ..DiagnosticArray::default()
     };
-    let Time { sec, nanosec } = wall_stamp().into();
-    (message.header.stamp.sec, message.header.stamp.nanosec) = (sec, nanosec);
+    message.header.stamp = wall_time();
     message
-}
-
-#[allow(clippy::disallowed_methods, reason = "a report says when it was made")]
-fn wall_stamp() -> Stamp {
-    let since = std::time::SystemTime::now().duration_since(std::time::SystemTime::UNIX_EPOCH).unwrap_or_default();
-    Stamp(i64::try_from(since.as_nanos()).unwrap_or(i64::MAX))
 }
 
 fn value(key: impl Into<String>, value: impl ToString) -> KeyValue {

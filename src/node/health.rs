@@ -2,8 +2,9 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
+use ros2_interfaces_jazzy_serde::builtin_interfaces::msg::Time;
 use rustix::time::{ClockId, clock_gettime};
 
 use super::inbox::Dropped;
@@ -186,6 +187,18 @@ impl SharedHealth {
 #[allow(clippy::disallowed_methods)]
 pub fn now() -> Instant {
     Instant::now()
+}
+
+/// The wall clock since 1970, for what says when it was sent or written.
+#[allow(clippy::disallowed_methods)]
+pub fn since_epoch() -> Duration {
+    SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default()
+}
+
+/// The same as a stamp.
+pub fn wall_time() -> Time {
+    let since = since_epoch();
+    Time { sec: i32::try_from(since.as_secs()).unwrap_or(i32::MAX), nanosec: since.subsec_nanos() }
 }
 
 /// Time that this thread has had on a processor \[s\].

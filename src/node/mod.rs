@@ -6,6 +6,7 @@
 
 pub mod announce;
 pub mod arguments;
+pub mod bond;
 pub mod diagnostics;
 pub mod drawing;
 pub mod health;
@@ -41,6 +42,7 @@ use drawing::Drawing;
 use health::SharedHealth;
 use inbox::Inbox;
 use learning::Learning;
+use lifecycle::State;
 use names::Names;
 use parameters::Parameters;
 use participant::Participant;
@@ -132,6 +134,7 @@ async fn live(
         ended: Arc::clone(&ended),
     };
     services::serve(&mut participant, &managed)?;
+    let bond = tokio::spawn(bond::keep(&mut participant, names.node.clone(), health.clone())?);
     tokio::spawn(diagnostics::watch(managed.clone()));
     info!("{} is there, domain {}", names.full(), participant.node.domain_id());
     if autostart {
@@ -147,6 +150,7 @@ async fn live(
         _ = terminated.recv() => info!("terminated"),
     }
     inbox.tell(Command::Stop);
+    health.lock().state = State::Finalized;
     // It is at a cloud at most.
     let _ = tokio::task::spawn_blocking(move || {
         let ended = thread.join();
@@ -156,6 +160,8 @@ async fn live(
         ended
     })
     .await;
+    // It says farewell.
+    let _ = bond.await;
     Ok(())
 }
 

@@ -20,6 +20,13 @@ use super::names::Names;
 /// The highest domain whose ports exist.
 const LAST_DOMAIN: u16 = 232;
 
+/// Messages that a reliable subscriber may be behind before the others wait for it. RustDDS does not overwrite what
+/// one has not acknowledged, so a subscriber that stands still would hold up all until its lease ends, 20 s by
+/// Fast DDS's default: so many are more than go on any topic until then.
+const MOST_UNACKNOWLEDGED: i32 = 2048;
+/// What is not taken in by then is given up.
+const PUBLISHED_WITHIN: std::time::Duration = std::time::Duration::from_millis(100);
+
 /// How a topic is kept and sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Quality {
@@ -32,15 +39,16 @@ pub struct Quality {
 }
 
 impl Quality {
-    fn policies(self) -> QosPolicies {
+    /// With as many samples at most as are kept, or `samples`.
+    fn policies(self, samples: i32) -> QosPolicies {
         let durability = if self.latched { policy::Durability::TransientLocal } else { policy::Durability::Volatile };
         let builder = QosPolicyBuilder::new()
             .durability(durability)
             .history(policy::History::KeepLast { depth: self.depth })
             .resource_limits(policy::ResourceLimits {
-                max_samples: self.depth.max(2),
+                max_samples: self.depth.max(samples),
                 max_instances: 1,
-                max_samples_per_instance: self.depth.max(2),
+                max_samples_per_instance: self.depth.max(samples),
             });
         match self.reliable {
             true => builder.reliable(Duration::from_millis(100)).build(),
@@ -96,14 +104,14 @@ impl Participant {
         self.names.resolve(name)
     }
 
-    fn topic(&self, name: &str, type_name: &str, quality: Quality) -> anyhow::Result<Topic> {
+    fn topic(&self, name: &str, type_name: &str, policies: &QosPolicies) -> anyhow::Result<Topic> {
         let (package, message) = type_name.split_once("/msg/").unwrap_or(("", type_name));
         Name::parse(name).map_err(|error| anyhow::anyhow!("topic `{name}`: {error}"))?;
         self.domain_participant()
             .create_topic(
                 format!("rt{name}"),
                 MessageTypeName::new(package, message).dds_msg_type(),
-                &quality.policies(),
+                policies,
                 TopicKind::NoKey,
             )
             .with_context(|| format!("topic {name}"))
@@ -119,7 +127,7 @@ impl Participant {
         type_name: &str,
         quality: Quality,
     ) -> anyhow::Result<Subscription<M>> {
-        let topic = self.topic(name, type_name, quality)?;
+        let topic = self.topic(name, type_name, &quality.policies(2))?;
         self.node.create_subscription(&topic, None).with_context(|| format!("subscribing to {name}"))
     }
 
@@ -133,7 +141,7 @@ impl Participant {
         type_name: &str,
         quality: Quality,
     ) -> anyhow::Result<Publisher<M>> {
-        let topic = self.topic(&self.resolve(name), type_name, quality)?;
+        let topic = self.topic(&self.resolve(name), type_name, &quality.policies(MOST_UNACKNOWLEDGED))?;
         self.node.create_publisher(&topic, None).with_context(|| format!("advertising {name}"))
     }
 
@@ -162,6 +170,17 @@ impl Participant {
         self.node
             .create_server(self.mapping, &parsed, &ServiceTypeName::new(package, service), quality.clone(), quality)
             .with_context(|| format!("serving {name}"))
+    }
+}
+
+/// Publishes a message, unless subscribers are so far behind that it would have to wait.
+///
+/// # Errors
+/// Why it was not sent.
+pub async fn publish<M: Serialize>(publisher: &Publisher<M>, message: M) -> Result<(), &'static str> {
+    match tokio::time::timeout(PUBLISHED_WITHIN, publisher.async_publish(message)).await {
+        Ok(published) => published.map_err(|_| "the network refused it"),
+        Err(_) => Err("a subscriber is behind"),
     }
 }
 

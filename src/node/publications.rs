@@ -15,7 +15,7 @@ use tokio::sync::mpsc;
 
 use super::health::{SharedHealth, now};
 use super::parameters::Parameters;
-use super::participant::{Participant, Quality};
+use super::participant::{Participant, Quality, publish};
 use super::recording::Recording;
 use crate::io::counters::Counters;
 use crate::ros::{MOST_BYTES, encoded_bytes, messages};
@@ -191,7 +191,7 @@ impl Publishers {
             tracing::warn!("{name}: {bytes} bytes, at most {MOST_BYTES} get through: not sent");
             Some("too large")
         } else {
-            publisher.async_publish(message).await.err().map(|_| "the network refused it")
+            publish(publisher, message).await.err()
         };
         let mut health = self.health.lock();
         match unsent {

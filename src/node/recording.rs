@@ -7,13 +7,12 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
-use std::time::SystemTime;
 
 use anyhow::Context as _;
 use serde::Serialize;
 use tracing::{info, warn};
 
-use super::health::SharedHealth;
+use super::health::{SharedHealth, since_epoch};
 use super::learning::give_way;
 use super::names::Names;
 use super::publications::{Publication, topics};
@@ -82,10 +81,9 @@ impl Recording {
     }
 }
 
-#[allow(clippy::disallowed_methods, reason = "bags are logged by the wall clock")]
+/// Bags are logged by the wall clock.
 fn wall_ns() -> u64 {
-    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
-    u64::try_from(since.as_nanos()).unwrap_or(u64::MAX)
+    u64::try_from(since_epoch().as_nanos()).unwrap_or(u64::MAX)
 }
 
 /// Writes what was published under the name that it has on the network.

@@ -2,16 +2,18 @@
 
 use std::fmt::{self, Write as _};
 use std::sync::OnceLock;
-use std::time::SystemTime;
 
 use ros2_client::Publisher;
-use ros2_interfaces_jazzy_serde::{builtin_interfaces::msg::Time, rcl_interfaces::msg::Log};
+use ros2_interfaces_jazzy_serde::rcl_interfaces::msg::Log;
 use tokio::sync::mpsc;
 use tracing::{
     Event, Level, Subscriber,
     field::{Field, Visit},
 };
 use tracing_subscriber::{Layer, layer::Context};
+
+use super::health::wall_time;
+use super::participant::publish;
 
 /// Lines that wait for the network at most; more are on standard error only.
 const MOST_WAITING: usize = 1000;
@@ -39,7 +41,7 @@ impl<S: Subscriber> Layer<S> for RosoutLayer {
         };
         // A full queue is no reason to stop: the line is on standard error.
         let _ = sender.try_send(Log {
-            stamp: now(),
+            stamp: wall_time(),
             level,
             name: String::new(),
             msg: text.message + &text.fields,
@@ -66,12 +68,6 @@ impl Visit for Text {
     }
 }
 
-#[allow(clippy::disallowed_methods, reason = "a log line says when it was written")]
-fn now() -> Time {
-    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
-    Time { sec: i32::try_from(since.as_secs()).unwrap_or(i32::MAX), nanosec: since.subsec_nanos() }
-}
-
 /// Sends what is logged from now on, under the node's name; ends with the runtime.
 pub async fn send(publisher: Publisher<Log>, node: String) {
     let (sender, mut lines) = mpsc::channel(MOST_WAITING);
@@ -80,6 +76,6 @@ pub async fn send(publisher: Publisher<Log>, node: String) {
     }
     while let Some(line) = lines.recv().await {
         // Nobody is left to tell of a log that cannot be sent.
-        let _ = publisher.async_publish(Log { name: node.clone(), ..line }).await;
+        let _ = publish(&publisher, Log { name: node.clone(), ..line }).await;
     }
 }

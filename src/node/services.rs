@@ -3,7 +3,6 @@
 use std::future::Future;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::SystemTime;
 
 use anyhow::Context as _;
 use ros2_client::Server;
@@ -27,7 +26,7 @@ use serde::{Serialize, de::DeserializeOwned};
 use tokio::sync::{Notify, oneshot};
 use tracing::{info, warn};
 
-use super::health::SharedHealth;
+use super::health::{SharedHealth, since_epoch, wall_time};
 use super::inbox::Inbox;
 use super::lifecycle::{State, Transition};
 use super::parameters::Parameters;
@@ -152,10 +151,8 @@ impl Managed {
             return SetParametersResult { successful: false, reason };
         }
         self.inbox.tell(Command::PublishTf(self.parameters().tf_prefix()));
-        let since = since_epoch();
         let mut event = ParameterEvent { node: self.name.clone(), ..ParameterEvent::default() };
-        event.stamp.sec = i32::try_from(since.as_secs()).unwrap_or(i32::MAX);
-        event.stamp.nanosec = since.subsec_nanos();
+        event.stamp = wall_time();
         event.changed_parameters = parameters.to_vec();
         self.outputs.send(Publication::ParameterEvent(event));
         SetParametersResult { successful: true, reason: String::new() }
@@ -194,11 +191,6 @@ pub fn with_topics(config: &InputConfig, resolved: &InputConfig) -> InputConfig 
         wrench.topic.clone_from(&resolved.topic);
     }
     config
-}
-
-#[allow(clippy::disallowed_methods, reason = "events say when they were")]
-fn since_epoch() -> std::time::Duration {
-    SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default()
 }
 
 /// Why something failed, in one line; many an error says its cause itself.

@@ -1,4 +1,4 @@
-//! This package's own messages and services, as serde structs whose CDR is that of the ROS types.
+//! This package's own messages and services, and `bond`'s, as serde structs whose CDR is that of the ROS types.
 //!
 //! Field for field as in `msg/` and `srv/`, which say what each means, in which unit and frame;
 //! `tests/messages.rs` holds the two together. A bounded sequence of at most one stands for what may
@@ -14,6 +14,17 @@ use serde::{Deserialize, Serialize};
 
 /// The ROS package that these are defined in.
 pub const PACKAGE: &str = "bayesian_object_models";
+
+/// bond/msg/Status.msg of bond_core: whether one side of a bond is there.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct BondStatus {
+    pub header: Header,
+    pub id: String,
+    pub instance_id: String,
+    pub active: bool,
+    pub heartbeat_timeout: f32,
+    pub heartbeat_period: f32,
+}
 
 /// msg/Quantity.msg
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]

@@ -5,6 +5,10 @@ peer.py SCENARIO [ARGUMENT...]   prints one JSON object with what was seen. Scen
 
 import array
 import json
+import os
+import pathlib
+import signal
+import subprocess
 import sys
 import time
 
@@ -36,6 +40,7 @@ from visualization_msgs.msg import MarkerArray
 
 from bayesian_object_models.msg import Criticism, ObjectPosterior, PredictedPartPoses, WrenchSegment
 from bayesian_object_models.srv import LoadModel, Predict, SaveModel
+from bond.msg import Status as BondStatus
 
 NODE = "/bom"
 TYPES = {
@@ -53,6 +58,32 @@ def quality(reliable=True, latched=False, depth=10):
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )
+
+
+class Bond:
+    """A lifecycle manager's side of a bond, as bondcpp has it."""
+
+    def __init__(self, node):
+        self.sides = []
+        self.publisher = node.create_publisher(BondStatus, "/bond", quality(depth=5))
+        node.create_subscription(BondStatus, "/bond", self.heard, quality(depth=100))
+        node.create_timer(0.1, lambda: self.say(True))
+
+    def say(self, active):
+        self.publisher.publish(BondStatus(id=NODE.strip("/"), instance_id="manager", active=active))
+
+    def heard(self, status):
+        if status.instance_id == "manager" or status.id != NODE.strip("/"):
+            return
+        if not self.sides or self.sides[-1] != (status.instance_id, status.active):
+            self.sides.append((status.instance_id, status.active))
+            if not status.active:
+                self.say(False)
+
+    def seen(self):
+        """Its sides as they came: the number of the instance, and whether it was there."""
+        instances = list(dict.fromkeys(instance for instance, _ in self.sides))
+        return [[instances.index(instance), active] for instance, active in self.sides]
 
 
 class Peer(Node):
@@ -168,6 +199,10 @@ def joints(posterior):
 
 def interval(quantity):
     return {"median": quantity.median, "q05": quantity.q05, "q95": quantity.q95}
+
+
+def seconds(stamp):
+    return stamp.sec + 1e-9 * stamp.nanosec
 
 
 def status(message):
@@ -327,6 +362,7 @@ def play(bag, settle="180"):
     return {
         "settled": settled,
         "windows": posterior.windows_learned,
+        "spans": [[seconds(w.start), seconds(w.end)] for w in posterior.recent_windows],
         "joints": joints(posterior),
         "medians": {
             e.child: [e.damping.median, e.friction.median, e.joint_inertia.median]
@@ -339,10 +375,44 @@ def play(bag, settle="180"):
     }
 
 
+def stands_still():
+    """A reliable subscriber that stops at its third message, with its process."""
+    node = Peer("stands_still")
+    node.hear(f"{NODE}/predicted_poses", PredictedPartPoses, quality())
+    node.wait(lambda: node.count("predicted_poses") > 2, 30.0)
+    os.kill(os.getpid(), signal.SIGSTOP)
+
+
+def held_up(bag):
+    """Whether a subscriber that stands still holds up what others hear."""
+    node = Peer()
+    ready(node)
+    player = Player(node, bag)
+    node.wait(lambda: node.count_subscribers("/parts/points") > 0, 10.0)
+    other = subprocess.Popen([sys.executable, __file__, "stands_still"], stdout=subprocess.DEVNULL)
+    stopped_at = []
+
+    def stopped(*_):
+        if not stopped_at and pathlib.Path(f"/proc/{other.pid}/stat").read_text().split()[2] == "T":
+            stopped_at.append(time.monotonic())
+        return not stopped_at or time.monotonic() - stopped_at[0] < 12.0
+
+    player.play(wanted=stopped)
+    other.kill()
+    after = [at for at, _ in node.heard[f"{NODE}/predicted_poses"] if stopped_at and at > stopped_at[0]]
+    return {
+        "stood_still": bool(stopped_at),
+        "heard": len(after),
+        "longest_gap": max((b - a for a, b in zip(after, after[1:])), default=None),
+    }
+
+
 def services():
     """Parameters, lifecycle and the node's own services, called as tools and managers do."""
     node = Peer()
+    bond = Bond(node)
     state, _ = ready(node)
+    bonded = node.wait(lambda: bond.seen() == [[0, True]], 10)
     names = node.call("list_parameters", ListParameters).result.names
     below = node.call("list_parameters", ListParameters, prefixes=["windows"], depth=1).result.names
     described = node.call("describe_parameters", DescribeParameters, names=["windows.quiet_s", "use_sim_time"])
@@ -376,7 +446,9 @@ def services():
     transitions = node.call("get_available_transitions", GetAvailableTransitions).available_transitions
     graph = node.call("get_transition_graph", GetAvailableTransitions).available_transitions
     # Deactivate, a wrong one, clean up; set what only then can be set; configure and activate again.
-    changes = [change(4), change(4), change(2)]
+    changes = [change(4)]
+    unbonded = node.wait(lambda: bond.seen()[-1:] == [[0, False]], 3)
+    changes += [change(4), change(2)]
     unconfigured = outcome(node.call("set_parameters", SetParameters, parameters=wanted[2:3]).results[0])
     changes += [change(1), change(3)]
     reset = node.call("reset", Trigger)
@@ -400,6 +472,8 @@ def services():
         "events": [e.goal_state.label for _, e in node.heard[f"{NODE}/transition_event"]],
         "parameter_events": [p.name for _, e in node.heard["/parameter_events"] for p in e.changed_parameters],
         "diagnostics": status(node.last("diagnostics")),
+        "bonded": [bonded, unbonded],
+        "bond": bond.seen(),
         "shutdown": change(7) if "shutdown" in sys.argv else None,
     }
 

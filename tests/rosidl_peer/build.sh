@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Builds this package's messages, and tf2_msgs, with the real rosidl, in a virtual environment.
+# Builds this package's messages, bond's and tf2_msgs', with the real rosidl, in a virtual environment.
 #
 #   tests/rosidl_peer/build.sh [--program] [FOLDER]
 #
@@ -29,8 +29,8 @@ exec {lock}>"$folder/lock"
 flock "$lock"
 
 cd "$repository"
-inputs=(msg srv CMakeLists.txt package.xml tests/rosidl_peer/tf2_msgs tests/rosidl_peer/requirements.txt)
-inputs+=(tests/rosidl_peer/build.sh)
+inputs=(msg srv CMakeLists.txt package.xml tests/rosidl_peer/bond tests/rosidl_peer/tf2_msgs)
+inputs+=(tests/rosidl_peer/requirements.txt tests/rosidl_peer/build.sh)
 wanted=$({
     echo "$venv"
     find "${inputs[@]}" -type f -print0 | sort -z | xargs -0 sha256sum
@@ -57,7 +57,7 @@ site=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("pureli
 libraries=$venv/lib
 for bundled in "$site"/*.libs; do libraries+=:$bundled; done
 prefixes=$venv paths=
-for package in tf2_msgs bayesian_object_models; do
+for package in bond tf2_msgs bayesian_object_models; do
     installed=$folder/install/$package
     prefixes=$installed:$prefixes
     paths+=$installed/${site#"$venv/"}:
@@ -81,13 +81,13 @@ ln -sfn "$repository" "$folder/source"
     # Not yet there: colcon would warn of it.
     export AMENT_PREFIX_PATH=$venv CMAKE_PREFIX_PATH=$venv PYTHONPATH=
     colcon --log-base "$folder/log" build \
-        --base-paths "$folder/source" "$here/tf2_msgs" --packages-select tf2_msgs bayesian_object_models \
+        --base-paths "$folder/source" "$here/bond" "$here/tf2_msgs" --packages-select bond tf2_msgs bayesian_object_models \
         --build-base "$folder/build" --install-base "$folder/install" --event-handlers console_direct- \
         --cmake-args "-DBOM_BUILD_PROGRAM=$program" "-DBOM_CARGO_TARGET_DIR=$target" \
         -DBUILD_TESTING=OFF -DCMAKE_CXX_FLAGS=-O0 -DCMAKE_C_FLAGS=-O0 \
         "-DPython3_EXECUTABLE=$venv/bin/python" "-DPYTHON_EXECUTABLE=$venv/bin/python"
 )
-(source "$environment" && python3 -c 'import bayesian_object_models.msg, bayesian_object_models.srv, tf2_msgs.msg')
+(source "$environment" && python3 -c 'import bayesian_object_models.msg, bayesian_object_models.srv, bond.msg, tf2_msgs.msg')
 if [ "$program" = ON ]; then
     installed=$folder/install/bayesian_object_models
     "$installed/lib/bayesian_object_models/bom" --help
