@@ -6,6 +6,7 @@
 mod world;
 
 use bayesian_object_models::model::DeclaredPhysics;
+use bayesian_object_models::types::Label;
 use bayesian_object_models::types::posterior::{Criticism, Verdict};
 use world::{Record, object};
 
@@ -45,6 +46,21 @@ fn a_model_that_explains_everything_is_adequate() {
         let found = findings("plain", number, &DeclaredPhysics::default());
         assert_eq!(found.verdict, Verdict::Adequate, "{:?}", found.effects);
         assert!(found.effects.is_empty() && found.before == found.after);
+    }
+}
+
+/// A joint that is braked in some windows, by another that is open: none of the library's effects.
+#[test]
+fn windows_that_noise_alone_explains_are_unknown() {
+    for number in 1..4 {
+        let (object, mut rng) = object("a joint that brakes another", 1.0, number);
+        let found = Record::of(&object, 9, &mut rng).criticize(&DeclaredPhysics::default()).1.findings();
+        assert_eq!(found.verdict, Verdict::Unexplained, "{number}");
+        let [unknown] = &found.effects[..] else { panic!("{number}: {:?}", found.effects) };
+        assert_eq!((unknown.name.as_str(), unknown.label), ("unknown", Some(Label(1))), "{number}");
+        let left: Vec<f64> = unknown.parameters.values().map(|force| force.median.abs()).collect();
+        let (least, most) = left.iter().fold((f64::INFINITY, 0.0_f64), |(l, m), f| (l.min(*f), m.max(*f)));
+        assert!(most > 3.0 * least, "{number}: all windows lack as much: {left:?}");
     }
 }
 

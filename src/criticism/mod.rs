@@ -183,14 +183,23 @@ impl Critic {
             };
             let found = selected.additions.iter().filter_map(|a| Some((loss(a)?, a)));
             let named = found.max_by(|a, b| a.0.total_cmp(&b.0)).is_some_and(|(_, a)| a.name() != "unknown");
+            let unknown = unknown_joints(&workshop, batch, &selected, &after);
+            let nothing_found = selected.rivals.is_empty();
             let verdict = match () {
                 () if before.densities.len() < 2 => Verdict::Insufficient,
                 () if named => Verdict::EffectFound,
-                () if !selected.rivals.is_empty() || leaves_much(&workshop, &selected, &after) => Verdict::Unexplained,
+                () if !nothing_found || !unknown.is_empty() || leaves_much(&workshop, &selected, &after) => {
+                    Verdict::Unexplained
+                }
                 () => Verdict::Adequate,
             };
             let mut findings = Criticism { verdict, effects: Vec::new(), before: before.rows, after: after.rows };
-            let found = findings.verdict != Verdict::Insufficient && !selected.rivals.is_empty();
+            if nothing_found && findings.verdict == Verdict::Unexplained {
+                let left = |joint: &usize| after.left.get(joint).map_or(&[][..], Vec::as_slice);
+                findings.effects =
+                    unknown.iter().map(|joint| findings::unknown(&fit.joints[*joint], left(joint))).collect();
+            }
+            let found = findings.verdict != Verdict::Insufficient && !nothing_found;
             let with = if found {
                 findings.effects = published.1;
                 published.0
@@ -268,6 +277,34 @@ fn leaves_much(workshop: &Workshop<'_>, selection: &Selection, scores: &Scores) 
         let force = row.force_rmse_n.or(row.torque_rmse_nm).unwrap_or(0.0);
         noise.is_some_and(|scale| scale >= MUCH.0) && force >= MUCH.1 * scales.force
     })
+}
+
+/// Windows that noise alone explains, of one joint: one may be an accident, so many are none.
+const NO_ACCIDENT: usize = 2;
+/// And the share of the joint's usual force that is left.
+const SOME: f64 = 0.05;
+
+/// Joints of which several windows are explained by process noise alone, and the others are not: what acts in
+/// those has no name here.
+fn unknown_joints(
+    workshop: &Workshop<'_>,
+    batch: &[BatchWindow],
+    selection: &Selection,
+    scores: &Scores,
+) -> Vec<usize> {
+    let scales = noise_scales_by_place(selection);
+    let by_noise = |joint: &usize| {
+        let windows = scales.iter().filter(|(w, scale)| **scale >= MUCH.0 && batch[**w].moving.contains(joint));
+        windows.count() >= NO_ACCIDENT
+    };
+    let is_felt = |joint: &usize| {
+        let label = workshop.fit.joints[*joint].child;
+        let row = scores.rows.iter().find(|row| row.label == label);
+        let force = row.and_then(|row| row.force_rmse_n.or(row.torque_rmse_nm));
+        let usual = workshop.learner.joint_scales(*joint, workshop.fit);
+        force.zip(usual).is_some_and(|(force, usual)| force >= SOME * usual.force)
+    };
+    (0..workshop.fit.joints.len()).filter(|joint| by_noise(joint) && is_felt(joint)).collect()
 }
 
 /// Beginning and end of each window \[s\].

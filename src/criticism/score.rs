@@ -26,6 +26,19 @@ pub struct Scores {
     pub rows: Vec<ResidualScore>,
     /// By place in the batch of the windows that could be scored \[nats\].
     pub densities: BTreeMap<usize, f64>,
+    /// By joint, what force was left of each of its windows that could be scored.
+    pub left: BTreeMap<usize, Vec<ForceLeft>>,
+}
+
+/// The force on a joint that a model leaves unexplained in a window.
+#[derive(Clone, Copy, Debug)]
+pub struct ForceLeft {
+    /// The middle of the window \[s\].
+    pub time_s: f64,
+    /// Its mean \[N or N·m\].
+    pub mean: f64,
+    /// Its standard deviation about that.
+    pub deviation: f64,
 }
 
 impl Scores {
@@ -61,6 +74,20 @@ struct Scored {
     residual: WindowResidual,
 }
 
+impl Scored {
+    fn force_left(&self, column: usize) -> ForceLeft {
+        let forces = &self.residual.forces;
+        let mean_of = |of: &dyn Fn(f64, f64) -> f64| {
+            let length: f64 = forces.iter().map(|(_, length, _)| length).sum();
+            forces.iter().map(|(time_s, length, force)| length * of(*time_s, force[column])).sum::<f64>()
+                / length.max(1e-9)
+        };
+        let mean = mean_of(&|_, force| force);
+        let deviation = mean_of(&|_, force| (force - mean).powi(2)).sqrt();
+        ForceLeft { time_s: mean_of(&|time_s, _| time_s), mean, deviation }
+    }
+}
+
 /// Scores a selected model on its windows; what cannot be scored of one component is no matter of the others.
 pub fn scores(workshop: &Workshop<'_>, batch: &[BatchWindow], selection: &Selection) -> Result<Scores, Failure> {
     let hypothesis = workshop.hypothesis(&selection.additions)?;
@@ -71,7 +98,8 @@ pub fn scores(workshop: &Workshop<'_>, batch: &[BatchWindow], selection: &Select
             Err(failure) => tracing::debug!(joints = ?component.joints, %failure, "not scored"),
         }
     }
-    let mut scores = Scores { rows: Vec::new(), densities: scored.iter().map(|s| (s.window, s.log_density)).collect() };
+    let densities = scored.iter().map(|s| (s.window, s.log_density)).collect();
+    let mut scores = Scores { rows: Vec::new(), densities, left: BTreeMap::new() };
     let mut by_joint: BTreeMap<usize, Vec<(usize, &Scored)>> = BTreeMap::new();
     for one in &scored {
         for (column, joint) in batch[one.window].moving.iter().enumerate() {
@@ -80,6 +108,7 @@ pub fn scores(workshop: &Workshop<'_>, batch: &[BatchWindow], selection: &Select
     }
     for (joint, windows) in by_joint {
         scores.rows.push(row(workshop, joint, &windows));
+        scores.left.insert(joint, windows.iter().map(|(column, one)| one.force_left(*column)).collect());
     }
     scores.rows.sort_by_key(|row| row.label);
     Ok(scores)
