@@ -284,8 +284,7 @@ const NO_ACCIDENT: usize = 2;
 /// And the share of the joint's usual force that is left.
 const SOME: f64 = 0.05;
 
-/// Joints of which several windows are explained by process noise alone, and the others are not: what acts in
-/// those has no name here.
+/// Joints of which several windows are explained by process noise alone: what acts in those has no name here.
 fn unknown_joints(
     workshop: &Workshop<'_>,
     batch: &[BatchWindow],
