@@ -317,17 +317,16 @@ fn a_recording_has_what_was_taken_and_said_and_replays_to_the_same() {
     let live_spans = since_first(serde_json::from_value(seen["spans"].clone()).unwrap());
     let replayed_spans = since_first(posterior["windows"].as_array().unwrap().iter().map(span).collect());
     let farthest = live_spans.as_flattened().iter().zip(replayed_spans.as_flattened()).map(|(a, b)| (a - b).abs());
-    let same_windows = farthest.fold(0.0, f64::max) < 1e-6;
+    let busy = "windows end elsewhere: was the machine too busy to learn them in time?";
+    assert!(farthest.fold(0.0, f64::max) < 1e-6, "{busy} {live_spans:?} {replayed_spans:?}\n{note}");
     for edge in posterior["edges"].as_array().unwrap() {
         let Some(medians) = seen["medians"].get(edge["child"].to_string()) else { continue };
         if edge["probability"].as_f64().unwrap() <= 0.5 {
             continue;
         }
         for (name, live) in ["damping", "friction", "joint_inertia"].iter().zip(medians.as_array().unwrap()) {
-            let live = live.as_f64().unwrap();
-            let [low, replayed, high] = ["q05", "median", "q95"].map(|key| edge[name][key].as_f64().unwrap());
-            let agrees = if same_windows { (live / replayed - 1.0).abs() < 1e-9 } else { (low..high).contains(&live) };
-            assert!(agrees, "{name}: live {live}, replayed {replayed}; {live_spans:?} {replayed_spans:?}\n{note}");
+            let (live, replayed) = (live.as_f64().unwrap(), edge[name]["median"].as_f64().unwrap());
+            assert!((live / replayed - 1.0).abs() < 1e-9, "{name}: live {live}, replayed {replayed}\n{note}");
         }
     }
     let bag = Bag::open(&record).unwrap();

@@ -26,7 +26,7 @@ use crate::mechanism::JointType;
 use crate::mechanism::effects::TableKind;
 use crate::model::{BatchWindow, DynamicsInput, DynamicsLearner, Hypothesis, KinematicFit};
 use crate::types::Label;
-use crate::types::posterior::{Criticism, EffectPosterior, Quantity, Verdict};
+use crate::types::posterior::{Criticism, EffectPosterior, Quantity, ResidualScore, Verdict};
 use rest::RestReadings;
 use score::{Scores, scores};
 
@@ -270,13 +270,17 @@ const MUCH: (f64, f64) = (30.0, 0.3);
 
 /// Whether a joint's residual force is large, and explained by process noise alone.
 fn leaves_much(workshop: &Workshop<'_>, selection: &Selection, scores: &Scores) -> bool {
-    scores.rows.iter().any(|row| {
-        let Some(joint) = workshop.fit.joints.iter().position(|joint| joint.child == row.label) else { return false };
-        let Some(scales) = workshop.learner.joint_scales(joint, workshop.fit) else { return false };
+    (0..workshop.fit.joints.len()).any(|joint| {
         let noise = crate::math::median(selection.noise_scales_of(Some(joint)));
-        let force = row.force_rmse_n.or(row.torque_rmse_nm).unwrap_or(0.0);
-        noise.is_some_and(|scale| scale >= MUCH.0) && force >= MUCH.1 * scales.force
+        noise.is_some_and(|scale| scale >= MUCH.0) && leaves(workshop, scores, joint, MUCH.1)
     })
+}
+
+/// Whether a joint's residual force is at least such a share of its usual one.
+fn leaves(workshop: &Workshop<'_>, scores: &Scores, joint: usize, share: f64) -> bool {
+    let row = scores.rows.iter().find(|row| row.label == workshop.fit.joints[joint].child);
+    let usual = workshop.learner.joint_scales(joint, workshop.fit);
+    row.and_then(ResidualScore::force_rmse).zip(usual).is_some_and(|(force, usual)| force >= share * usual.force)
 }
 
 /// Windows that noise alone explains, of one joint: one may be an accident, so many are none.
@@ -296,13 +300,7 @@ fn unknown_joints(
         let windows = scales.iter().filter(|(w, scale)| **scale >= MUCH.0 && batch[**w].moving.contains(joint));
         windows.count() >= NO_ACCIDENT
     };
-    let is_felt = |joint: &usize| {
-        let label = workshop.fit.joints[*joint].child;
-        let row = scores.rows.iter().find(|row| row.label == label);
-        let force = row.and_then(|row| row.force_rmse_n.or(row.torque_rmse_nm));
-        let usual = workshop.learner.joint_scales(*joint, workshop.fit);
-        force.zip(usual).is_some_and(|(force, usual)| force >= SOME * usual.force)
-    };
+    let is_felt = |joint: &usize| leaves(workshop, scores, *joint, SOME);
     (0..workshop.fit.joints.len()).filter(|joint| by_noise(joint) && is_felt(joint)).collect()
 }
 

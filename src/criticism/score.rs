@@ -50,7 +50,7 @@ impl Scores {
     /// Whether force and position together are simulated better, over all parts.
     pub fn simulates_better_than(&self, other: &Self) -> bool {
         let lack = |row: &ResidualScore| {
-            let force = row.force_rmse_n.or(row.torque_rmse_nm).unwrap_or(0.0).max(1e-30);
+            let force = row.force_rmse().unwrap_or(0.0).max(1e-30);
             force.ln() + (row.position_rmse_m.hypot(row.rotation_rmse_rad)).max(1e-30).ln()
         };
         let sum = |scores: &Self| scores.rows.iter().map(lack).sum::<f64>();

@@ -4,12 +4,13 @@
 //! is behind gets old samples (`KeepLast` alone does not drop them).
 
 use std::net::{IpAddr, Ipv4Addr};
+use std::time::Duration;
 
 use anyhow::{Context as _, bail};
 use ros2_client::{
     Context, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher, Server, ServiceMapping, ServiceTypeName,
     Subscription,
-    ros2::{Duration, QosPolicies, QosPolicyBuilder, QosProfile, policy},
+    ros2::{QosPolicies, QosPolicyBuilder, QosProfile, policy},
 };
 use ros2_interfaces_jazzy_serde::rcl_interfaces::msg::Log;
 use rustdds::{DomainParticipant, DomainParticipantBuilder, Topic, TopicKind};
@@ -25,7 +26,7 @@ const LAST_DOMAIN: u16 = 232;
 /// Fast DDS's default: so many are more than go on any topic until then.
 const MOST_UNACKNOWLEDGED: i32 = 2048;
 /// What is not taken in by then is given up.
-const PUBLISHED_WITHIN: std::time::Duration = std::time::Duration::from_millis(100);
+const PUBLISHED_WITHIN: Duration = Duration::from_millis(100);
 
 /// How a topic is kept and sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -51,7 +52,7 @@ impl Quality {
                 max_samples_per_instance: self.depth.max(samples),
             });
         match self.reliable {
-            true => builder.reliable(Duration::from_millis(100)).build(),
+            true => builder.reliable(PUBLISHED_WITHIN.into()).build(),
             false => builder.best_effort().build(),
         }
     }

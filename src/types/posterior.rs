@@ -348,6 +348,13 @@ pub struct ResidualScore {
     pub residual_whiteness_p: f64,
 }
 
+impl ResidualScore {
+    /// The residual force, by the joint's type \[N or N·m\].
+    pub fn force_rmse(&self) -> Option<f64> {
+        self.force_rmse_n.or(self.torque_rmse_nm)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -230,7 +230,7 @@ impl Problem<'_> {
 }
 
 impl StaySystem {
-    pub(super) fn add_pose(&mut self, row: &PoseRow, pull: &Vector6<f64>) {
+    fn add_pose(&mut self, row: &PoseRow, pull: &Vector6<f64>) {
         self.information += row.information;
         self.gradient -= pull;
         let own = row.error.into_iter().flat_map(|error| {
@@ -248,7 +248,7 @@ impl StaySystem {
 
 impl WindowSystem {
     /// Adds a pose's share: Jᵀ Λ J and Jᵀ Λ r.
-    pub(super) fn add_pose(&mut self, row: &PoseRow) {
+    fn add_pose(&mut self, row: &PoseRow) {
         let pull = row.information * row.residual;
         if let Some(stay) = row.stay {
             self.stays[stay].0.add_pose(row, &pull);

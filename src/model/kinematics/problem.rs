@@ -98,7 +98,7 @@ impl<'a> Problem<'a> {
     }
 
     /// Every frame its own unknown, or one for a whole window where a joint rests.
-    pub(super) fn separate_frames(&mut self) {
+    fn separate_frames(&mut self) {
         self.slots.clear();
         self.slot_counts.clear();
         for window in &self.positions {
@@ -115,7 +115,7 @@ impl<'a> Problem<'a> {
         }
     }
 
-    pub(super) fn initial_contact_points(&self, window: usize) -> Vec<Vector3<f64>> {
+    fn initial_contact_points(&self, window: usize) -> Vec<Vector3<f64>> {
         self.windows[window]
             .contacts
             .iter()
@@ -188,7 +188,7 @@ impl<'a> Problem<'a> {
         [one(0), one(1)].into_iter().flatten()
     }
 
-    pub(super) fn student_cost(&self, chi_squared: f64, dimensions: f64) -> f64 {
+    fn student_cost(&self, chi_squared: f64, dimensions: f64) -> f64 {
         let freedom = self.settings.student_freedom;
         0.5 * (freedom + dimensions) * (chi_squared / freedom).ln_1p()
     }
@@ -221,7 +221,7 @@ impl<'a> Problem<'a> {
     }
 
     /// What a window adds to the cost.
-    pub(super) fn window_cost(&self, w: usize) -> f64 {
+    fn window_cost(&self, w: usize) -> f64 {
         let window = self.windows[w];
         let of_stay = |stay: &Stay| 0.5 * stay.error.component_mul(&stay.error).dot(&stay.information);
         let mut cost = self.stays[w].iter().map(of_stay).sum::<f64>();

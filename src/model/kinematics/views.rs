@@ -127,7 +127,7 @@ impl Problem<'_> {
 
     /// Eᵀ, with E Eᵀ the covariance of the error that goes with a view, ξ as in [`PoseMeasurement`]: `view_error`
     /// in every direction, and [`ALIKE_SHARE`] of what the measurement states, as outlines err alike in all frames.
-    pub(super) fn view_error(&self, information: &Matrix6<f64>, radius: f64) -> Matrix6<f64> {
+    fn view_error(&self, information: &Matrix6<f64>, radius: f64) -> Matrix6<f64> {
         let scale = length_scale(radius);
         let mut eigen = in_lengths(information, radius).symmetric_eigen();
         let least = self.settings.view_error.powi(2);
@@ -139,11 +139,7 @@ impl Problem<'_> {
     /// By joint and faces: the views of its child, with the gradient in the global unknowns (columns) that one
     /// `view_error` in each of six directions causes. Looks within `shared_distance` are one view.
     /// `solves` are those of the undamped systems.
-    pub(super) fn views(
-        &self,
-        systems: &[WindowSystem],
-        solves: &[Option<LocalSolve>],
-    ) -> Vec<[Vec<(Look, DMatrix<f64>)>; 2]> {
+    fn views(&self, systems: &[WindowSystem], solves: &[Option<LocalSolve>]) -> Vec<[Vec<(Look, DMatrix<f64>)>; 2]> {
         let errors = self.shared.view_errors.get_or_init(|| {
             self.by_measurement(|w, j, frame, face| {
                 let raw = self.measured(w, j, frame, face).filter(|_| self.references[j].is_none())?;
