@@ -16,6 +16,7 @@ use bayesian_object_models::{
         ingest::Ingest,
         model_file::{BagHash, SavedModel, write_model},
         output_file::OutputFile,
+        recorded_windows::recorded_windows,
         topics::MissingTopics,
     },
     pipeline::{Output, Pipeline},
@@ -89,6 +90,8 @@ pub fn run(arguments: &ReplayArguments) -> anyhow::Result<()> {
     // Opened before the work, so that a wrong path does not cost a run.
     let mut outputs = Outputs::open(arguments, &config.input.fixed_frame)?;
     let mut replay = Replay::new(arguments, &config)?;
+    let window_ends = recorded_windows(&arguments.bag, bag.summary())?;
+    replay.pipeline = replay.pipeline.with_window_ends(window_ends);
     replay.read(&mut bag, &mut outputs)?;
 
     let mut remarks: Vec<String> = missing.iter().map(ToString::to_string).collect();

@@ -54,8 +54,8 @@ pub fn effects(
     effects
 }
 
-/// That several windows of a joint are explained by noise alone, and something acts in them therefore: none of 120
-/// plain objects of `examples/criticism_benchmark.rs` and of 33 bags without undeclared effects was called so.
+/// That something acts on a joint which noise or a friction of every window's own stands in for: none of 180 plain
+/// objects of `examples/criticism_benchmark.rs` was called so.
 const UNKNOWN: f64 = 0.95;
 
 /// What acts on a joint and has no name, by the force that is left of its windows over time.

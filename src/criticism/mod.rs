@@ -145,7 +145,7 @@ impl Critic {
                 let before = scores(&workshop, batch, &base).unwrap_or_default();
                 (base.clone(), before, selector.select(base)?)
             };
-            let selected = selector.describe_leftover(selected)?;
+            let (selected, drifting) = selector.describe_leftover(selected)?;
             let (mut selected, mut after) = confirmed(&selector, &base, &before, selected)?;
             // Nor is a last addition there that does not predict better.
             let all: Vec<usize> = (0..batch.len()).collect();
@@ -183,7 +183,7 @@ impl Critic {
             };
             let found = selected.additions.iter().filter_map(|a| Some((loss(a)?, a)));
             let named = found.max_by(|a, b| a.0.total_cmp(&b.0)).is_some_and(|(_, a)| a.name() != "unknown");
-            let unknown = unknown_joints(&workshop, batch, &selected, &after);
+            let unknown = unknown_joints(&workshop, batch, &selected, &drifting, &after);
             let nothing_found = selected.rivals.is_empty();
             let verdict = match () {
                 () if before.densities.len() < 2 => Verdict::Insufficient,
@@ -288,11 +288,13 @@ const NO_ACCIDENT: usize = 2;
 /// And the share of the joint's usual force that is left.
 const SOME: f64 = 0.05;
 
-/// Joints of which several windows are explained by process noise alone: what acts in those has no name here.
+/// Joints of which several windows are explained by process noise alone, or that are `drifting`: what acts on
+/// those has no name here.
 fn unknown_joints(
     workshop: &Workshop<'_>,
     batch: &[BatchWindow],
     selection: &Selection,
+    drifting: &BTreeSet<usize>,
     scores: &Scores,
 ) -> Vec<usize> {
     let scales = noise_scales_by_place(selection);
@@ -301,7 +303,9 @@ fn unknown_joints(
         windows.count() >= NO_ACCIDENT
     };
     let is_felt = |joint: &usize| leaves(workshop, scores, *joint, SOME);
-    (0..workshop.fit.joints.len()).filter(|joint| by_noise(joint) && is_felt(joint)).collect()
+    (0..workshop.fit.joints.len())
+        .filter(|joint| drifting.contains(joint) || (by_noise(joint) && is_felt(joint)))
+        .collect()
 }
 
 /// Beginning and end of each window \[s\].

@@ -146,7 +146,12 @@ impl Workshop<'_> {
                 for [from, to] in &self.spans {
                     // Windows may touch.
                     let from = nodes.last().map_or(*from, |last| from.max(last + 1e-3));
-                    nodes.extend(even(from, to.max(from + 0.1), if kind == TableKind::ForceOverTime { 12 } else { 3 }));
+                    let to = to.max(from + 0.1);
+                    match kind {
+                        TableKind::ForceOverTime => nodes.extend(even(from, to, 12)),
+                        // What acts in a whole window is one number.
+                        _ => nodes.push(0.5 * (from + to)),
+                    }
                 }
                 (nodes, if kind == TableKind::ForceOverTime { 0.5 } else { 10.0 })
             }

@@ -18,6 +18,7 @@ pub mod output_file;
 pub mod point_cloud;
 mod point_field;
 pub mod pose_information;
+pub mod recorded_windows;
 mod resolve;
 pub mod topics;
 pub mod transforms;

@@ -19,6 +19,9 @@ use super::publications::{Publication, topics};
 use crate::io::bag::{FolderRecorder, RecordError, Recorder};
 use crate::io::counters::Counters;
 use crate::io::ingest::Message;
+use crate::io::messages::Header;
+use crate::io::recorded_windows::WINDOWS;
+use crate::types::Stamp;
 
 /// Messages that wait to be written at most: two seconds of a camera and a wrench.
 const MOST_WAITING: usize = 512;
@@ -26,6 +29,8 @@ const MOST_WAITING: usize = 512;
 enum Entry {
     Accepted(Arc<str>, Message<'static>),
     Published(Publication),
+    /// The last frame of a window.
+    Window(Stamp),
     /// No more will come.
     End,
 }
@@ -67,6 +72,11 @@ impl Recording {
         self.put(Entry::Published(publication));
     }
 
+    /// A window ended with the frame of this stamp.
+    pub fn window(&self, last: Stamp) {
+        self.put(Entry::Window(last));
+    }
+
     fn put(&self, entry: Entry) {
         if self.sender.try_send((wall_ns(), entry)).is_err() {
             Counters::add(&mut self.health.lock().unsent, "the recording is behind", 1);
@@ -101,7 +111,9 @@ impl Say<'_> {
 
 fn write_all(mut folder: FolderRecorder, entries: &Receiver<(u64, Entry)>, names: &Names) -> Result<u64, RecordError> {
     give_way();
-    let (mut log_ns, mut count) = (0, 0);
+    let (mut log_ns, mut count) = (wall_ns(), 0);
+    // Of no window: those that end are told from now on.
+    Say { recorder: folder.recorder(), names, log_ns }.message(WINDOWS, &Header::default())?;
     while let Ok((at_ns, entry)) = entries.recv() {
         // Readers go by log times: no two are the same.
         log_ns = at_ns.max(log_ns + 1);
@@ -117,6 +129,9 @@ fn write_all(mut folder: FolderRecorder, entries: &Receiver<(u64, Entry)>, names
                     Message::Pose(message) => recorder.message(&topic, type_name, log_ns, &message)?,
                     Message::Tf(message) => recorder.message(&topic, type_name, log_ns, &message)?,
                 }
+            }
+            Entry::Window(last) => {
+                Say { recorder, names, log_ns }.message(WINDOWS, &Header { stamp: last.into(), ..Header::default() })?
             }
             Entry::Published(publication) => {
                 let mut say = Say { recorder, names, log_ns };

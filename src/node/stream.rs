@@ -325,6 +325,9 @@ impl Stream {
                 Output::WindowClosed(window) => {
                     let (from, to) = window.span_s();
                     info!("window of {from:.1} s to {to:.1} s closed");
+                    if let Some(recording) = &self.recording {
+                        recording.window(Stamp(zero.plus_seconds(to).0 - self.shift_ns));
+                    }
                     for dropped in self.learning.put(self.life, window) {
                         let (from, to) = dropped.span_s();
                         warn!("window of {from:.1} s to {to:.1} s is dropped: too many wait to be learned");

@@ -21,7 +21,7 @@ mod windows;
 mod worker;
 mod working_frame;
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
@@ -178,6 +178,8 @@ pub struct Pipeline {
     closed_windows: u64,
     backlog: Option<Backlog>,
     clock: Clock,
+    /// Frames with which windows end where all is quiet, if that was decided before.
+    window_ends: Option<BTreeSet<Stamp>>,
     /// The latest stamp of a frame.
     newest: Option<Stamp>,
     /// Windows are scored, not learned.
@@ -199,6 +201,7 @@ impl Pipeline {
         Self {
             backlog,
             clock: || 0.0,
+            window_ends: None,
             poses: PoseBuffer::new(settings.poses),
             last_frame_s: None,
             settings,
@@ -239,6 +242,13 @@ impl Pipeline {
     #[must_use]
     pub fn timed_by(self, clock: Clock) -> Self {
         Self { clock, ..self }
+    }
+
+    /// The same with windows that end, where all is quiet, with the frames of these stamps: whether a part still
+    /// moves is not asked.
+    #[must_use]
+    pub fn with_window_ends(self, window_ends: Option<BTreeSet<Stamp>>) -> Self {
+        Self { window_ends, ..self }
     }
 
     /// What has been learned; `None` before the first window.
@@ -320,7 +330,7 @@ impl Pipeline {
         frame.moves = self.poses.something_moves(frame.time_s, &frame.poses);
         outputs.extend(self.take_up(&frame, zero));
         outputs.extend(self.observe(&frame));
-        let moving = self.moving;
+        let moving = self.window_ends.as_ref().map_or(self.moving, |ends| !ends.contains(&stamp));
         let seen = self.backlog.is_some().then(|| frame.clone());
         if !self.is_open() && self.learner.is_none() && self.first_look.is_none() {
             self.reference.push(frame.clone());
