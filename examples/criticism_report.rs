@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use bayesian_object_models::io::config::Config;
-use study::{Learned, Study, import, learn};
+use study::{Calibration, Learned, Study, import, learn};
 
 fn main() -> anyhow::Result<()> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
@@ -30,7 +30,7 @@ fn main() -> anyhow::Result<()> {
     text.push_str("\n## Bags with undeclared physics\n");
     text.push_str(
         "\nErrors are of windows scored before they are learned. *Told* is a model that has the effect \
-         declared from the start.\n",
+         declared from the start, of the sensor one whose readings were corrected by the truth.\n",
     );
     for name in ["catch", "spring", "delay", "bias"] {
         let bag = bags.join(format!("undeclared_{name}"));
@@ -109,18 +109,18 @@ fn section(text: &mut String, (study, learned, scores): &study::Outcome, docs: &
 
 fn bag_section(text: &mut String, name: &str, bag: &Path, docs: &Path) -> anyhow::Result<()> {
     let mut told = Config::default();
-    let learned = learn(&[bag.to_owned()], &Config::default())?;
+    let bags = [bag.to_owned()];
+    let learned = learn(&bags, &told, &Calibration::default())?;
     let _ = writeln!(text, "\n### undeclared_{name}\n");
     text.push_str(&learned.finding());
-    let told = match name {
-        "bias" | "delay" => None,
-        effect => {
-            told.model.effects = serde_json::from_str(&format!("[\"{effect}\"]"))?;
-            Some(learn(&[bag.to_owned()], &told)?)
-        }
+    let told = if matches!(name, "bias" | "delay") {
+        learn(&bags, &told, &Calibration::of_truth(bag)?)?
+    } else {
+        told.model.effects = serde_json::from_str(&format!("[\"{name}\"]"))?;
+        learn(&bags, &told, &Calibration::default())?
     };
     text.push('\n');
-    text.push_str(&prequential(&learned, told.as_ref()));
+    text.push_str(&prequential(&learned, &told));
     text.push_str(&learned.declined());
     let scores = learned.fitted_scores(1.0);
     text.push_str(&plot::residuals(&scores, &format!("undeclared_{name}"), docs)?);
@@ -128,13 +128,13 @@ fn bag_section(text: &mut String, name: &str, bag: &Path, docs: &Path) -> anyhow
 }
 
 /// Before and after, each window scored before it was learned, and by a model that was told.
-fn prequential(learned: &Learned, told: Option<&Learned>) -> String {
+fn prequential(learned: &Learned, told: &Learned) -> String {
     let mut text = String::from("| part | before | after | told |\n|---|---|---|---|\n");
     let found = learned.criticism();
-    let of_told = told.map(Learned::criticism);
+    let of_told = told.criticism();
     let cell = study::residual_cell;
     for (before, after) in found.before.iter().zip(&found.after) {
-        let told = of_told.as_ref().and_then(|told| told.after.iter().find(|row| row.label == before.label));
+        let told = of_told.after.iter().find(|row| row.label == before.label);
         let told = told.map_or_else(|| "-".to_owned(), cell);
         let _ = writeln!(text, "| {} | {} | {} | {told} |", before.label, cell(before), cell(after));
     }

@@ -5,10 +5,11 @@
 #[allow(dead_code, missing_docs, reason = "shared with the benchmark, which uses more of it")]
 mod world;
 
-use bayesian_object_models::model::DeclaredPhysics;
+use bayesian_object_models::mechanism::effects::EffectKind;
+use bayesian_object_models::model::{DeclaredPhysics, WindowObservations};
 use bayesian_object_models::types::Label;
 use bayesian_object_models::types::posterior::{Criticism, Verdict};
-use world::{Record, object};
+use world::{Record, Undeclared, object};
 
 fn findings(name: &str, number: u64, declared: &DeclaredPhysics) -> Criticism {
     let (object, mut rng) = object(name, 1.0, number);
@@ -92,6 +93,22 @@ fn an_effect_that_was_declared_is_not_found_again() {
         DeclaredPhysics { effects: serde_json::from_str("[\"spring\"]").unwrap(), ..DeclaredPhysics::default() };
     let found = findings("spring", 0, &declared);
     assert_eq!(found.verdict, Verdict::Adequate, "{:?}", found.effects);
+}
+
+/// The models on the way have it too, as it was fitted.
+#[test]
+fn an_effect_that_was_declared_is_in_every_model() {
+    let declared = DeclaredPhysics { effects: vec![EffectKind::GravityOffset], ..DeclaredPhysics::default() };
+    let (object, mut rng) = object("gravity_offset", 1.0, 0);
+    let Some(Undeclared::Effect(_, truth)) = &object.undeclared else { panic!("{object:?}") };
+    let record = Record::of(&object, 5, &mut rng);
+    let (learner, critic) = record.criticize(&declared);
+    let windows: Vec<&WindowObservations> = record.windows.iter().collect();
+    let stages = critic.stages(&learner, &record.fit(5), &record.input(&windows)).unwrap();
+    let model = &stages[0].hypothesis.mechanism.joints[0];
+    let offset = EffectKind::GravityOffset.parameters()[0]
+        .physical(stages[0].x[model.effect_offset(0)], &model.effects[0].scales);
+    assert!((offset / truth[0] - 1.0).abs() < 0.1, "{offset}, truth {truth:?}");
 }
 
 #[test]

@@ -10,7 +10,7 @@ use bayesian_object_models::io::config::Config;
 use bayesian_object_models::io::import::{self as importing, ImportSpec, Table};
 use bayesian_object_models::pipeline::StageScore;
 
-use crate::study::{learn, score};
+use crate::study::{Calibration, learn, score};
 
 /// Openings of a door that are used at most, its first: some have 25.
 const MOST_OPENINGS: usize = 10;
@@ -99,7 +99,7 @@ fn study(door: &Door, table: &Path, root: &Path, scratch: &Path) -> anyhow::Resu
             importing::import(Table::from_file(table)?, &spec, spec.splits.get(name), &bag)?;
             Ok(bag)
         };
-        let learned = learn(&[bag("others")?], &config)?;
+        let learned = learn(&[bag("others")?], &config, &Calibration::default())?;
         let scores = score(&learned, &[bag("one")?], &config)?;
         let rms = |stage: Option<&StageScore>| {
             let part = stage.and_then(|stage| stage.parts.values().next()).context("nothing was scored")?;

@@ -11,6 +11,8 @@ use bayesian_object_models::io::ingest::Ingest;
 use bayesian_object_models::io::model_file::{SavedModel, write_model};
 use bayesian_object_models::pipeline::{PartScore, Pipeline, Scores, StageScore};
 use bayesian_object_models::types::posterior::{Criticism, Quantity, ResidualScore, Verdict};
+use bayesian_object_models::types::{AppliedWrench, Input};
+use nalgebra::Vector3;
 
 /// Parameters of an effect that are written out at most; tables have more.
 const MOST_PARAMETERS: usize = 6;
@@ -36,7 +38,7 @@ pub struct Learned(Pipeline);
 impl Study {
     /// Learns and scores.
     pub fn run(self) -> anyhow::Result<Outcome> {
-        let learned = learn(&self.fit, &self.config)?;
+        let learned = learn(&self.fit, &self.config, &Calibration::default())?;
         let scores = score(&learned, &self.score, &self.config)?;
         Ok((self, learned, scores))
     }
@@ -60,23 +62,54 @@ pub fn import(
     Ok(())
 }
 
+/// Errors of a wrench sensor that are known: readings are corrected before anything sees them.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Calibration {
+    /// A constant in the readings, in world axes \[N\].
+    pub bias: Vector3<f64>,
+    /// Reports are late by this \[s\].
+    pub delay_s: f64,
+}
+
+impl Calibration {
+    /// The sensor's errors in a simulated bag, whose tool frame has the axes of the world.
+    pub fn of_truth(bag: &Path) -> anyhow::Result<Self> {
+        let text = std::fs::read_to_string(bag.join("truth.json")).context("truth.json")?;
+        let truth: serde_json::Value = serde_json::from_str(&text)?;
+        let number = |value: &serde_json::Value| value.as_f64().context("truth.json: a number is missing");
+        let [x, y, z] = [0, 1, 2].map(|axis| number(&truth["bias_N"][axis]));
+        Ok(Self { bias: Vector3::new(x?, y?, z?), delay_s: number(&truth["delay_s"])? })
+    }
+
+    fn corrected(&self, input: Input) -> Input {
+        match input {
+            Input::Wrench(wrench) => Input::Wrench(AppliedWrench {
+                stamp: wrench.stamp.plus_seconds(-self.delay_s),
+                force_in_world: wrench.force_in_world - self.bias,
+                ..wrench
+            }),
+            other => other,
+        }
+    }
+}
+
 /// Everything in a bag goes through a pipeline.
-fn stream(pipeline: &mut Pipeline, bag: &Path, config: &Config) -> anyhow::Result<()> {
+fn stream(pipeline: &mut Pipeline, bag: &Path, config: &Config, known: &Calibration) -> anyhow::Result<()> {
     let mut ingest = Ingest::new(&config.input);
     for message in Bag::open(bag)? {
         for input in ingest.push(&message.topic.name, &message.topic.type_name, message.bytes()) {
-            pipeline.push(input);
+            pipeline.push(known.corrected(input));
         }
     }
     for input in ingest.flush() {
-        pipeline.push(input);
+        pipeline.push(known.corrected(input));
     }
     pipeline.finish();
     Ok(())
 }
 
 /// Learns bags, one after the other; predictions are not asked for.
-pub fn learn(bags: &[PathBuf], config: &Config) -> anyhow::Result<Learned> {
+pub fn learn(bags: &[PathBuf], config: &Config, known: &Calibration) -> anyhow::Result<Learned> {
     let mut settings = config.pipeline_settings(None);
     settings.predict = false;
     let mut last: Option<Learned> = None;
@@ -85,7 +118,7 @@ pub fn learn(bags: &[PathBuf], config: &Config) -> anyhow::Result<Learned> {
             None => Pipeline::new(settings.clone()),
             Some(learned) => Pipeline::resume(settings.clone(), learned.saved()?.object)?,
         };
-        stream(&mut pipeline, bag, config)?;
+        stream(&mut pipeline, bag, config, known)?;
         last = Some(Learned(pipeline));
     }
     let Some(learned) = last else { bail!("no bags") };
@@ -100,7 +133,7 @@ pub fn score(learned: &Learned, bags: &[PathBuf], config: &Config) -> anyhow::Re
     for bag in bags {
         let saved = learned.saved()?.object;
         let mut pipeline = Pipeline::evaluate(settings.clone(), saved, config.evaluation_horizon_s)?;
-        stream(&mut pipeline, bag, config)?;
+        stream(&mut pipeline, bag, config, &Calibration::default())?;
         let scores = pipeline.scores().cloned().unwrap_or_default();
         all.windows += scores.windows;
         all.stages.resize_with(scores.stages.len().max(all.stages.len()), StageScore::default);

@@ -30,6 +30,8 @@ use crate::types::posterior::{Criticism, EffectPosterior, Quantity, ResidualScor
 use rest::RestReadings;
 use score::{Scores, scores};
 
+/// Linearizations of a fit in which all windows have the same process noise, and how often that is chosen anew.
+const EVEN: (usize, usize) = (8, 0);
 /// Windows of the same joints that are looked at together at most.
 const MOST_WINDOWS: usize = 8;
 /// Standard deviations of the sensor's errors by the prior: force \[N\], torque \[N·m\], delay \[s\].
@@ -226,7 +228,7 @@ impl Critic {
 
 impl Critic {
     /// The declared physics, and with it every model on the way to the last selection, each fitted anew to
-    /// all windows.
+    /// all windows, with the process noise of the usual one in all of them.
     ///
     /// # Errors
     /// Where one of them cannot be fitted.
@@ -257,9 +259,16 @@ impl Critic {
             let hypothesis = workshop.hypothesis(&selection.additions)?;
             let named = selection.additions.iter().filter(|a| !matches!(a, Addition::Stop(..)));
             let effects = named.map(|a| (a.joint().map(|joint| fit.joints[joint].child), a.name())).collect();
-            let x = selection.numbers.laid_out(&hypothesis, &selection.additions);
-            let scales = noise_scales(&selection, &batch).into_iter().map(|(_, scale)| scale).collect();
-            Ok(Stage { effects, hypothesis, x, noise_scale: crate::math::median(scales).unwrap_or(1.0) })
+            let mut x = selection.numbers.laid_out(&hypothesis, &selection.additions);
+            // A model that lacks something explains some windows by chance, which would then count for all.
+            let noise_scale = crate::math::median(selection.noise_scales_of(None)).unwrap_or(1.0);
+            let scales = noise_scales_by_place(&selection);
+            for component in &selection.components {
+                let windows: Vec<&BatchWindow> = component.windows.iter().map(|&w| &batch[w]).collect();
+                let usual = vec![usual_noise_scale(component, &scales); windows.len()];
+                x = hypothesis.fit(&windows, &x, &usual, EVEN)?.x;
+            }
+            Ok(Stage { effects, hypothesis, x, noise_scale })
         };
         selections.into_iter().map(stage).collect()
     }

@@ -196,6 +196,13 @@ pub fn places(hypothesis: &Hypothesis, addition: Addition) -> Vec<usize> {
     }
 }
 
+/// How many numbers of a joint are declared, those of declared effects among them: they come before what is added.
+fn declared_size(hypothesis: &Hypothesis, additions: &BTreeSet<Addition>, joint: usize) -> usize {
+    let model = &hypothesis.mechanism.joints[joint];
+    let added = additions.iter().filter(|a| matches!(a, Addition::Effect(other, _) if *other == joint)).count();
+    model.effect_offset(model.effects.len().saturating_sub(added))
+}
+
 impl Numbers {
     /// The numbers in the layout of a hypothesis; what is not known is at its prior mean.
     pub fn laid_out(&self, hypothesis: &Hypothesis, additions: &BTreeSet<Addition>) -> Vec<f64> {
@@ -206,9 +213,8 @@ impl Numbers {
         }
         for (joint, own) in self.joints.iter().enumerate() {
             let offset = mechanism.offset(joint);
-            if own.len() == SIZE {
-                x[offset..offset + SIZE].copy_from_slice(own);
-            }
+            let size = declared_size(hypothesis, additions, joint).min(own.len());
+            x[offset..offset + size].copy_from_slice(&own[..size]);
         }
         for addition in additions {
             let known = self.added.get(addition);
@@ -225,11 +231,11 @@ impl Numbers {
     pub fn take(&mut self, hypothesis: &Hypothesis, additions: &BTreeSet<Addition>, x: &[f64], joints: &[usize]) {
         self.joints.resize_with(hypothesis.mechanism.joints.len(), Vec::new);
         for joint in 0..self.joints.len() {
-            if !joints.contains(&joint) && self.joints[joint].len() == SIZE {
+            if !joints.contains(&joint) && self.joints[joint].len() >= SIZE {
                 continue;
             }
             let offset = hypothesis.mechanism.offset(joint);
-            self.joints[joint] = x[offset..offset + SIZE].to_vec();
+            self.joints[joint] = x[offset..offset + declared_size(hypothesis, additions, joint)].to_vec();
         }
         for addition in additions.iter().filter(|a| a.joint().is_none_or(|joint| joints.contains(&joint))) {
             let values = places(hypothesis, *addition).into_iter().map(|place| x[place]).collect();

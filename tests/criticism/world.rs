@@ -417,20 +417,24 @@ impl Record {
         }
     }
 
+    /// The first windows as they come, the last of them new.
+    pub fn input<'a>(&'a self, windows: &'a [&'a WindowObservations]) -> DynamicsInput<'a> {
+        DynamicsInput {
+            windows,
+            contacts: std::slice::from_ref(&self.contacts[windows.len() - 1]),
+            zero: Stamp(0),
+            parts: &self.hulls,
+            use_tool: true,
+        }
+    }
+
     /// Learns all windows and looks at the whole.
     pub fn criticize(&self, declared: &DeclaredPhysics) -> (DynamicsLearner, Critic) {
         let mut learner = DynamicsLearner::new(GRAVITY).declaring(declared.clone());
         let mut critic = Critic::default();
         for count in 1..=self.windows.len() {
             let windows: Vec<&WindowObservations> = self.windows[..count].iter().collect();
-            let contacts = [self.contacts[count - 1].clone()];
-            let input = DynamicsInput {
-                windows: &windows,
-                contacts: &contacts,
-                zero: Stamp(0),
-                parts: &self.hulls,
-                use_tool: true,
-            };
+            let input = self.input(&windows);
             let fit = self.fit(count);
             learner.learn_window(&fit, &input);
             if count == self.windows.len() {

@@ -30,7 +30,7 @@ impl Selector<'_> {
     pub fn select(&self, mut current: Selection) -> Result<Selection, Failure> {
         let declared = self.workshop.learner.declared_mechanism();
         let friction_declared = declared.joints.iter().all(|joint| joint.friction);
-        let budget = current.steps + self.budget();
+        let mut budget = current.steps + self.budget();
         let mut held_out = HeldOut::of(self.workshop, self.batch, &current).unwrap_or_default();
         let mut richer: Option<(f64, Trial)> = None;
         while current.rivals.len() < MOST * declared.joints.len().max(1) {
@@ -99,8 +99,7 @@ impl Selector<'_> {
                         held_out = after;
                         current = Selection { steps: current.steps, ..pair };
                         self.settle(&mut current)?;
-                        self.drop_stops(&mut current)?;
-                        self.add_stops(&mut current);
+                        budget += self.look_for_stops(&mut current)?;
                         current.note_step();
                     }
                     None => break,
@@ -135,8 +134,7 @@ impl Selector<'_> {
             current.rivals.extend(best.also.iter().map(|other| (*other, vec![(None, -best.gain)])));
             current.rivals.insert(addition, rivals);
             self.settle(&mut current)?;
-            self.drop_stops(&mut current)?;
-            self.add_stops(&mut current);
+            budget += self.look_for_stops(&mut current)?;
             // What gained by leading to a better optimum of the model before it is not needed itself.
             if let Some(without) = self.as_good_without(&current, &had, needs_of(addition))? {
                 tracing::debug!(?addition, evidence = without.log_evidence, "a better optimum without");

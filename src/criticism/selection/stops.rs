@@ -38,8 +38,16 @@ impl Selector<'_> {
         }
     }
 
+    /// Looks at the end stops anew, by a model that lacks less; returns what that cost, which is no candidate's.
+    pub(super) fn look_for_stops(&self, current: &mut Selection) -> Result<usize, Failure> {
+        let before = current.steps;
+        self.drop_stops(current)?;
+        self.add_stops(current);
+        Ok(current.steps - before)
+    }
+
     /// Drops the end stops that the windows call for no more: what was lacking may have looked like one.
-    pub(super) fn drop_stops(&self, current: &mut Selection) -> Result<(), Failure> {
+    fn drop_stops(&self, current: &mut Selection) -> Result<(), Failure> {
         let is_stop = |a: &&Addition| matches!(a, Addition::Stop(..));
         let stops: Vec<Addition> = current.additions.iter().filter(is_stop).copied().collect();
         for stop in stops {

@@ -3,9 +3,7 @@
 use nalgebra::DMatrix;
 
 use super::batch::{BatchWindow, Hypothesis};
-use super::layout::{
-    AddedEffect, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism, SENSOR_SIZE, SIZE, UPPER,
-};
+use super::layout::{AddedEffect, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism, SENSOR_SIZE, UPPER};
 use super::learner::{
     Block, DynamicsInput, DynamicsLearner, Site, Warm, added_effect, extended, kinematics_of, standard_sensor,
     travel_of,
@@ -123,12 +121,13 @@ impl DynamicsLearner {
         Ok(Hypothesis { mechanism, prior })
     }
 
-    /// The first numbers of each joint as they are believed now, and the sensor's.
+    /// The declared numbers of each joint as they are believed now, and the sensor's.
     pub fn numbers(&self) -> Result<(Vec<Vec<f64>>, Vec<f64>), Failure> {
         let (mean, _) = self.belief.product(None).moments(&self.blocks())?;
         let joints = (0..self.mechanism.joints.len()).map(|k| {
-            let offset = self.mechanism.offset(k);
-            mean.rows(offset, SIZE).iter().copied().collect()
+            let (offset, model) = (self.mechanism.offset(k), &self.mechanism.joints[k]);
+            let declared = model.effect_offset(self.declared.effects.len().min(model.effects.len()));
+            mean.rows(offset, declared).iter().copied().collect()
         });
         Ok((joints.collect(), mean.rows(mean.len() - SENSOR_SIZE, SENSOR_SIZE).iter().copied().collect()))
     }
