@@ -139,6 +139,7 @@ pub fn score(learned: &Learned, bags: &[PathBuf], config: &Config) -> anyhow::Re
         all.stages.resize_with(scores.stages.len().max(all.stages.len()), StageScore::default);
         for (sum, stage) in all.stages.iter_mut().zip(scores.stages) {
             sum.effects = stage.effects;
+            sum.values.extend(stage.values);
             for (label, part) in stage.parts {
                 add(sum.parts.entry(label).or_default(), part);
             }

@@ -30,8 +30,10 @@ use crate::types::posterior::{Criticism, EffectPosterior, Quantity, ResidualScor
 use rest::RestReadings;
 use score::{Scores, scores};
 
-/// Linearizations of a fit in which all windows have the same process noise, and how often that is chosen anew.
+/// Linearizations of a fit in which windows have the process noise of the usual one, which is not chosen anew.
 const EVEN: (usize, usize) = (8, 0);
+/// κ of a window that keeps its own there, in units of the usual one's.
+const APART: f64 = 10.0;
 /// Windows of the same joints that are looked at together at most.
 const MOST_WINDOWS: usize = 8;
 /// Standard deviations of the sensor's errors by the prior: force \[N\], torque \[N·m\], delay \[s\].
@@ -142,8 +144,7 @@ impl Critic {
                 (base, before, selected)
             } else {
                 tracing::debug!(?outlying, "windows left out");
-                let base_additions = base.additions.clone();
-                let base = selector.fitted(&base_additions, &base.numbers, (6, 1))?;
+                let base = selector.base(&base.numbers)?;
                 let before = scores(&workshop, batch, &base).unwrap_or_default();
                 (base.clone(), before, selector.select(base)?)
             };
@@ -228,7 +229,7 @@ impl Critic {
 
 impl Critic {
     /// The declared physics, and with it every model on the way to the last selection, each fitted anew to
-    /// all windows, with the process noise of the usual one in all of them.
+    /// all windows with the process noise of the usual one, but for windows that need far more.
     ///
     /// # Errors
     /// Where one of them cannot be fitted.
@@ -265,8 +266,10 @@ impl Critic {
             let scales = noise_scales_by_place(&selection);
             for component in &selection.components {
                 let windows: Vec<&BatchWindow> = component.windows.iter().map(|&w| &batch[w]).collect();
-                let usual = vec![usual_noise_scale(component, &scales); windows.len()];
-                x = hypothesis.fit(&windows, &x, &usual, EVEN)?.x;
+                let usual = usual_noise_scale(component, &scales);
+                let own = |w: &usize| scales.get(w).copied().filter(|scale| *scale > APART * usual);
+                let even: Vec<f64> = component.windows.iter().map(|w| own(w).unwrap_or(usual)).collect();
+                x = hypothesis.fit(&windows, &x, &even, EVEN)?.x;
             }
             Ok(Stage { effects, hypothesis, x, noise_scale })
         };

@@ -57,6 +57,8 @@ pub struct StageScore {
     pub effects: Vec<(Option<Label>, &'static str)>,
     /// By part, those that moved.
     pub parts: BTreeMap<Label, PartScore>,
+    /// What it says of their joints, by name; see [`crate::model::Mechanism::values`].
+    pub values: BTreeMap<Label, BTreeMap<String, f64>>,
 }
 
 /// The scores of a stream.
@@ -111,7 +113,13 @@ impl Scores {
             stage.effects.clone_from(&model.effects);
             let residual = model.hypothesis.window(window, model.noise_scale).residual(&model.x, horizon_s);
             match residual {
-                Ok(residual) => stage.add(&residual, window, learner),
+                Ok(residual) => {
+                    stage.add(&residual, window, learner);
+                    for joint in &window.moving {
+                        let Some(known) = learner.joints().get(*joint) else { continue };
+                        stage.values.insert(known.child, model.hypothesis.mechanism.values(*joint, &model.x));
+                    }
+                }
                 Err(failure) => tracing::warn!(%failure, effects = ?model.effects, "a window is not scored"),
             }
         }

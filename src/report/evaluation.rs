@@ -1,5 +1,6 @@
 //! What `bom evaluate` found: a table and a JSON document.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::io::Write;
 
@@ -39,6 +40,8 @@ struct Step {
     /// What it has beyond the declared physics.
     effects: Vec<EffectName>,
     residuals: Vec<Residuals>,
+    /// By part, what the model says of its joint, SI units.
+    parameters: BTreeMap<Label, BTreeMap<String, f64>>,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -50,7 +53,7 @@ struct EffectName {
 impl Step {
     fn of(stage: &StageScore) -> Self {
         let effects = stage.effects.iter().map(|(label, name)| EffectName { name, label: *label });
-        Self { effects: effects.collect(), residuals: residuals_of(stage) }
+        Self { effects: effects.collect(), residuals: residuals_of(stage), parameters: stage.values.clone() }
     }
 }
 
@@ -163,6 +166,7 @@ mod tests {
         let stage = |effects: &[(Option<Label>, &'static str)], parts: [PartScore; 2]| StageScore {
             effects: effects.to_vec(),
             parts: [Label(1), Label(5)].into_iter().zip(parts).collect(),
+            values: BTreeMap::from([(Label(1), BTreeMap::from([("damping".to_owned(), 7.0)]))]),
         };
         let less = PartScore { force: (0.02, 2.0), ..slide.clone() };
         let stages = vec![stage(&[], [slide, hinge.clone()]), stage(&[(Some(Label(1)), "spring")], [less, hinge])];
@@ -180,6 +184,7 @@ part  windows   position   rotation        force
         assert_eq!(table(&evaluation), expected);
         let value = serde_json::to_value(&evaluation).unwrap();
         assert_eq!(value["before"][1]["torque_rmse_Nm"], 0.5);
+        assert_eq!(value["steps"][1]["parameters"]["1"]["damping"], 7.0);
         assert!(value["before"][1].get("force_rmse_N").is_none());
         assert_eq!(value["steps"][1]["effects"][0]["name"], "spring");
     }

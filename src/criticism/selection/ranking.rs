@@ -2,10 +2,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::{Selection, Selector};
+use super::trials::{FAR_OFF, GLANCE};
+use super::{FIRST_SCALES, Selection, Selector};
 use crate::criticism::numbers::Addition;
 use crate::criticism::signature::{Ranked, probes};
 use crate::inference::Failure;
+use crate::math::median;
 use crate::mechanism::effects::EffectKind;
 
 /// How many of the ranked are refitted, and from how much first-order gain on \[nats\].
@@ -29,6 +31,12 @@ impl Selector<'_> {
         for component in &current.components {
             let Some(fitted) = &component.fitted else { continue };
             let windows = self.windows(&component.windows);
+            // Noise that explains whole windows leaves no residual to show a signature.
+            let scales: Vec<f64> = fitted.windows.iter().map(|window| window.noise_scale).collect();
+            let calm = (!self.several() && median(scales).is_some_and(|usual| usual >= FAR_OFF))
+                .then(|| hypothesis.fit(&windows, &fitted.x, &vec![FIRST_SCALES[0]; windows.len()], (GLANCE.0, 0)));
+            let calm = calm.and_then(Result::ok);
+            let fitted = calm.as_ref().unwrap_or(fitted);
             let moved: Vec<usize> = component
                 .joints
                 .iter()

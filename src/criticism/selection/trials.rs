@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use super::ranking::KNOWN;
-use super::{Component, FIRST_SCALES, REFIT, Selection, Selector};
+use super::{CALM, Component, FIRST_SCALES, REFIT, Selection, Selector};
 use crate::criticism::numbers::Addition;
 use crate::criticism::signature::{Ranked, start_by_direction};
 use crate::inference::Failure;
@@ -12,7 +12,7 @@ use crate::mechanism::effects::EffectKind;
 use crate::model::{BatchFit, Hypothesis};
 
 /// κ from which on a model is far off.
-const FAR_OFF: f64 = 1e3;
+pub(super) const FAR_OFF: f64 = 1e3;
 /// κ of a window that needs more than the usual one, in units of that.
 const NOISY: f64 = 3.0;
 /// Some candidates start with κ larger by this, too.
@@ -23,7 +23,7 @@ const DELAYS: [f64; 4] = [-0.8, 0.3, 1.0, 2.0];
 /// Beside friction that is not known yet a signature says little of it: it is tried from either side of none.
 const NEAR_DELAYS: [f64; 2] = [-0.1, 0.1];
 /// Linearizations where several joints move and candidates are only glanced at.
-const GLANCE: (usize, usize) = (4, 1);
+pub(super) const GLANCE: (usize, usize) = (4, 1);
 /// Friction that was not declared starts from these shares of a joint's usual force, near what is known and far
 /// from it.
 const FRICTION_STARTS: [f64; 2] = [0.3, 0.1];
@@ -124,7 +124,8 @@ impl Selector<'_> {
             // The numbers of a model that is far off mislead.
             addition if !self.several() && far_off(current, addition) => {
                 let anew = bland.with_noise_scales(|_| FIRST_SCALES[0]);
-                [current.clone(), anew].map(|from| (from, candidate.clone())).into()
+                let calm = current.with_noise_scales(|_| CALM);
+                [current.clone(), anew, calm].map(|from| (from, candidate.clone())).into()
             }
             _ => return self.trial(current, candidate, if self.several() { GLANCE } else { REFIT }),
         };

@@ -7,6 +7,8 @@
 //! a mass within a factor of three times a centre within a few centimetres. In logs their product is a
 //! sum: what gravity shows of a hinge is one straight line for all windows.
 
+use std::collections::BTreeMap;
+
 use nalgebra::{DMatrix, DVector, Matrix2, Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
@@ -440,6 +442,28 @@ impl Mechanism {
     /// How many numbers there are.
     pub fn size(&self) -> usize {
         self.offset(self.joints.len()) + SENSOR_SIZE
+    }
+
+    /// What numbers say of a joint: `inertia` about it, or mass on it, of its own body, `damping`, `friction` where
+    /// the model has it, and the parameters of effects as `effect.parameter`; SI units.
+    pub fn values(&self, joint: usize, x: &[f64]) -> BTreeMap<String, f64> {
+        let (model, first) = (&self.joints[joint], self.offset(joint));
+        let mut values = BTreeMap::from([("inertia".to_owned(), x[first + INERTIA].exp())]);
+        let by_direction = model.effects.iter().any(|effect| effect.kind == EffectKind::AsymmetricFriction);
+        if !by_direction {
+            values.insert("damping".to_owned(), x[first + DAMPING].exp());
+        }
+        if model.friction && !by_direction {
+            values.insert("friction".to_owned(), x[first + FRICTION].exp());
+        }
+        for (i, effect) in model.effects.iter().enumerate() {
+            let at = first + model.effect_offset(i);
+            for (k, parameter) in effect.kind.parameters().iter().enumerate() {
+                let name = format!("{}.{}", effect.kind.name(), parameter.name);
+                values.insert(name, parameter.physical(x[at + k], &effect.scales));
+            }
+        }
+        values
     }
 
     /// The sensor's numbers that the model has, counted from the sensor's first.
