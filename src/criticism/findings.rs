@@ -30,11 +30,10 @@ pub fn effects(
         let mut same: Vec<String> = likely.filter_map(|(rival, _)| Some(rival.as_ref()?.name().to_owned())).collect();
         let mut probability = 1.0 / total;
         for name in class_of(*addition, fit) {
-            if !same.contains(&(*name).to_owned()) {
-                same.push((*name).to_owned());
-                probability = probability.min(0.5);
-            }
+            probability = probability.min(0.5);
+            same.push((*name).to_owned());
         }
+        same.retain(|name| name != addition.name());
         same.sort();
         same.dedup();
         let gain = rivals.iter().find(|(rival, _)| rival.is_none()).map_or(0.0, |(_, difference)| -difference);

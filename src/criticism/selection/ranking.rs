@@ -9,6 +9,7 @@ use crate::criticism::signature::{Ranked, probes};
 use crate::inference::Failure;
 use crate::math::median;
 use crate::mechanism::effects::EffectKind;
+use crate::model::{BatchFit, BatchWindow, Hypothesis};
 
 /// How many of the ranked are refitted, and from how much first-order gain on \[nats\].
 const REFITTED: usize = 5;
@@ -31,11 +32,7 @@ impl Selector<'_> {
         for component in &current.components {
             let Some(fitted) = &component.fitted else { continue };
             let windows = self.windows(&component.windows);
-            // Noise that explains whole windows leaves no residual to show a signature.
-            let scales: Vec<f64> = fitted.windows.iter().map(|window| window.noise_scale).collect();
-            let calm = (!self.several() && median(scales).is_some_and(|usual| usual >= FAR_OFF))
-                .then(|| hypothesis.fit(&windows, &fitted.x, &vec![FIRST_SCALES[0]; windows.len()], (GLANCE.0, 0)));
-            let calm = calm.and_then(Result::ok);
+            let calm = self.with_little_noise(&hypothesis, fitted, &windows);
             let fitted = calm.as_ref().unwrap_or(fitted);
             let moved: Vec<usize> = component
                 .joints
@@ -85,6 +82,21 @@ impl Selector<'_> {
         // What was found before is tried from where it was, and anew.
         leftover.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
         Ok((ranked, leftover))
+    }
+
+    /// A fit of windows that noise explains as a whole, with little of it: else no residual is left to show a
+    /// signature.
+    fn with_little_noise(
+        &self,
+        hypothesis: &Hypothesis,
+        fitted: &BatchFit,
+        windows: &[&BatchWindow],
+    ) -> Option<BatchFit> {
+        let usual = median(fitted.windows.iter().map(|window| window.noise_scale).collect())?;
+        if self.several() || usual < FAR_OFF {
+            return None;
+        }
+        hypothesis.fit(windows, &fitted.x, &vec![FIRST_SCALES[0]; windows.len()], (GLANCE.0, 0)).ok()
     }
 
     /// The best few of every joint, and the sensor's.
