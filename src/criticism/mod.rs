@@ -265,7 +265,7 @@ impl Critic {
             let noise_scale = crate::math::median(selection.noise_scales_of(None)).unwrap_or(1.0);
             let scales = noise_scales_by_place(&selection);
             for component in &selection.components {
-                let windows: Vec<&BatchWindow> = component.windows.iter().map(|&w| &batch[w]).collect();
+                let windows = selector.windows(&component.windows);
                 let usual = usual_noise_scale(component, &scales);
                 let own = |w: &usize| scales.get(w).copied().filter(|scale| *scale > APART * usual);
                 let even: Vec<f64> = component.windows.iter().map(|w| own(w).unwrap_or(usual)).collect();

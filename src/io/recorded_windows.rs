@@ -6,7 +6,7 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use super::bag::{Bag, BagError, BagSummary};
+use super::bag::{Bag, BagError, BagSummary, TopicInfo};
 use super::cdr::decode;
 use super::messages::Header;
 use crate::types::Stamp;
@@ -15,10 +15,9 @@ use crate::types::Stamp;
 /// the first, stamped 0, is for none and says that the others count.
 pub const WINDOWS: (&str, &str) = ("~/windows", "std_msgs/msg/Header");
 
-/// Whether a bag is the recording of a node.
-fn has_windows(summary: &BagSummary) -> bool {
-    let is_it = |name: &str, type_name: &str| name.ends_with("/windows") && type_name == WINDOWS.1;
-    summary.topics.iter().any(|(topic, count)| is_it(&topic.name, &topic.type_name) && *count > 0)
+/// Whether a topic is that of a recording.
+fn is_windows(topic: &TopicInfo) -> bool {
+    topic.name.ends_with("/windows") && topic.type_name == WINDOWS.1
 }
 
 /// The stamps of the last frames of a recording's windows; none where a bag has no such topic.
@@ -26,10 +25,10 @@ fn has_windows(summary: &BagSummary) -> bool {
 /// # Errors
 /// A bag that cannot be opened anew.
 pub fn recorded_windows(path: &Path, summary: &BagSummary) -> Result<Option<BTreeSet<Stamp>>, BagError> {
-    if !has_windows(summary) {
+    if !summary.topics.iter().any(|(topic, count)| is_windows(topic) && *count > 0) {
         return Ok(None);
     }
-    let messages = Bag::open(path)?.filter(|message| message.topic.name.ends_with("/windows"));
+    let messages = Bag::open(path)?.filter(|message| is_windows(&message.topic));
     let headers = messages.filter_map(|message| decode::<Header>(message.bytes()).ok());
     Ok(Some(headers.map(|header| Stamp::from(header.stamp)).collect()))
 }

@@ -107,13 +107,17 @@ impl Say<'_> {
     fn message<M: Serialize>(&mut self, (name, type_name): topics::Topic, message: &M) -> Result<(), RecordError> {
         self.recorder.message(&self.names.resolve(name), type_name, self.log_ns, message)
     }
+
+    fn window(&mut self, last: Stamp) -> Result<(), RecordError> {
+        self.message(WINDOWS, &Header { stamp: last.into(), ..Header::default() })
+    }
 }
 
 fn write_all(mut folder: FolderRecorder, entries: &Receiver<(u64, Entry)>, names: &Names) -> Result<u64, RecordError> {
     give_way();
     let (mut log_ns, mut count) = (wall_ns(), 0);
     // Of no window: those that end are told from now on.
-    Say { recorder: folder.recorder(), names, log_ns }.message(WINDOWS, &Header::default())?;
+    Say { recorder: folder.recorder(), names, log_ns }.window(Stamp(0))?;
     while let Ok((at_ns, entry)) = entries.recv() {
         // Readers go by log times: no two are the same.
         log_ns = at_ns.max(log_ns + 1);
@@ -130,9 +134,7 @@ fn write_all(mut folder: FolderRecorder, entries: &Receiver<(u64, Entry)>, names
                     Message::Tf(message) => recorder.message(&topic, type_name, log_ns, &message)?,
                 }
             }
-            Entry::Window(last) => {
-                Say { recorder, names, log_ns }.message(WINDOWS, &Header { stamp: last.into(), ..Header::default() })?
-            }
+            Entry::Window(last) => Say { recorder, names, log_ns }.window(last)?,
             Entry::Published(publication) => {
                 let mut say = Say { recorder, names, log_ns };
                 match &publication {

@@ -113,13 +113,7 @@ impl Scores {
             stage.effects.clone_from(&model.effects);
             let residual = model.hypothesis.window(window, model.noise_scale).residual(&model.x, horizon_s);
             match residual {
-                Ok(residual) => {
-                    stage.add(&residual, window, learner);
-                    for joint in &window.moving {
-                        let Some(known) = learner.joints().get(*joint) else { continue };
-                        stage.values.insert(known.child, model.hypothesis.mechanism.values(*joint, &model.x));
-                    }
-                }
+                Ok(residual) => stage.add(model, &residual, window, learner),
                 Err(failure) => tracing::warn!(%failure, effects = ?model.effects, "a window is not scored"),
             }
         }
@@ -127,9 +121,11 @@ impl Scores {
 }
 
 impl StageScore {
-    fn add(&mut self, residual: &WindowResidual, window: &BatchWindow, learner: &Learner) {
-        for (column, joint) in window.moving.iter().enumerate() {
-            let Some(joint) = learner.joints().get(*joint) else { continue };
+    fn add(&mut self, model: &Stage, residual: &WindowResidual, window: &BatchWindow, learner: &Learner) {
+        for (column, &index) in window.moving.iter().enumerate() {
+            let Some(joint) = learner.joints().get(index) else { continue };
+            let values = || model.hypothesis.mechanism.values(index, &model.x);
+            self.values.entry(joint.child).or_insert_with(values);
             let part = self.parts.entry(joint.child).or_default();
             part.windows += 1;
             part.turns = joint.joint_type == JointType::Revolute;

@@ -241,11 +241,8 @@ impl Selector<'_> {
                 _ => LEAST_GAIN,
             };
             if without.log_evidence > current.log_evidence - least {
-                let mut rivals = std::mem::take(&mut current.rivals);
-                rivals.remove(&addition);
-                let (stages, declined) = (std::mem::take(&mut current.stages), std::mem::take(&mut current.declined));
-                let leftover = std::mem::take(&mut current.leftover);
-                *current = Selection { rivals, stages, declined, leftover, steps: current.steps, ..without };
+                current.rivals.remove(&addition);
+                current.go_on_as(without);
             }
         }
         Ok(())

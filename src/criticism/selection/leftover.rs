@@ -45,7 +45,7 @@ impl Selector<'_> {
         let leftover = current.leftover.clone();
         tracing::debug!(?leftover, "leftover");
         let budget = current.steps + self.budget() / 2;
-        let mut best: BTreeMap<usize, (f64, Trial)> = BTreeMap::new();
+        let mut best: BTreeMap<usize, Trial> = BTreeMap::new();
         let mut tried: BTreeMap<usize, usize> = BTreeMap::new();
         for (addition, gain) in leftover {
             let Some(joint) = addition.joint() else { continue };
@@ -65,19 +65,22 @@ impl Selector<'_> {
             if matches!(addition, Addition::Table(_, TableKind::FrictionOverTime)) && trial.gain > LEAST_TABLE_GAIN {
                 drifting.insert(joint);
             }
-            if trial.gain > LEAST_TABLE_GAIN && best.get(&joint).is_none_or(|(other, _)| trial.gain > *other) {
-                best.insert(joint, (trial.gain, trial));
+            if trial.gain > LEAST_TABLE_GAIN && best.get(&joint).is_none_or(|other| trial.gain > other.gain) {
+                best.insert(joint, trial);
             }
         }
         let mut held_out = match best.is_empty() {
             true => HeldOut::default(),
             false => HeldOut::of(self.workshop, self.batch, &current).unwrap_or_default(),
         };
-        for (gain, trial) in best.into_values() {
-            // The layout may have changed since.
+        for mut trial in best.into_values() {
             let addition = trial.addition;
-            let ranked = Ranked { addition, gain, start: Vec::new(), also: Vec::new() };
-            let Some(trial) = self.calm_trial(&current, &ranked, REFIT) else { continue };
+            // Another table has been added since it was tried.
+            if !trial.additions.is_superset(&current.additions) {
+                let ranked = Ranked { addition, gain: trial.gain, start: Vec::new(), also: Vec::new() };
+                let Some(anew) = self.calm_trial(&current, &ranked, REFIT) else { continue };
+                trial = anew;
+            }
             let mut next = current.clone();
             self.take(&mut next, &trial);
             let Some(after) = self.holding(&next, &held_out, &current.additions, &mut current.steps) else { continue };

@@ -90,6 +90,13 @@ impl Selection {
         other
     }
 
+    /// Goes on as another fit; what was compared on the way stays.
+    fn go_on_as(&mut self, fitted: Self) {
+        let Self { additions, numbers, components, log_evidence, .. } = fitted;
+        (self.additions, self.numbers) = (additions, numbers);
+        (self.components, self.log_evidence) = (components, log_evidence);
+    }
+
     fn note_step(&mut self) {
         self.stages.push(Step { additions: self.additions.clone(), numbers: self.numbers.clone() });
     }
@@ -142,7 +149,8 @@ impl Selector<'_> {
         windows.iter().map(one).sum()
     }
 
-    fn windows(&self, places: &[usize]) -> Vec<&BatchWindow> {
+    /// Windows by their places in the batch.
+    pub fn windows(&self, places: &[usize]) -> Vec<&BatchWindow> {
         places.iter().map(|&w| &self.batch[w]).collect()
     }
 
@@ -223,11 +231,10 @@ impl Selector<'_> {
         if current.noise_scales_of(None).into_iter().any(|scale| scale >= MISFIT)
             && let Ok(calm) = self.fitted_from(&current.additions, &current.numbers, CALM, (10, 2))
         {
-            let steps = current.steps + calm.steps;
+            current.steps += calm.steps;
             if calm.log_evidence > current.log_evidence {
-                current = calm;
+                current.go_on_as(calm);
             }
-            current.steps = steps;
         }
         Ok(current)
     }
@@ -246,7 +253,7 @@ impl Selector<'_> {
     fn settle(&self, current: &mut Selection) -> Result<(), Failure> {
         let hypothesis = self.workshop.hypothesis(&current.additions)?;
         for component in &mut current.components {
-            let windows: Vec<&BatchWindow> = component.windows.iter().map(|&w| &self.batch[w]).collect();
+            let windows = self.windows(&component.windows);
             for _ in 0..SETTLING.0 {
                 let Some(fitted) = &component.fitted else { break };
                 let scales: Vec<f64> = fitted.windows.iter().map(|window| window.noise_scale).collect();
@@ -290,7 +297,7 @@ impl Selector<'_> {
         if let Ok(hypothesis) = self.workshop.hypothesis(&current.additions) {
             let x = current.numbers.laid_out(&hypothesis, &current.additions);
             for component in &mut current.components {
-                let windows: Vec<&BatchWindow> = component.windows.iter().map(|&w| &self.batch[w]).collect();
+                let windows = self.windows(&component.windows);
                 let Some(fitted) = &mut component.fitted else { continue };
                 fitted.x.clone_from(&x);
                 for (own, window) in fitted.windows.iter_mut().zip(&windows) {
@@ -336,8 +343,9 @@ impl Selector<'_> {
         selected.numbers.added.extend(of_base.map(|(addition, own)| (*addition, own.clone())));
         if together {
             let fitted = self.fitted(&selected.additions, &selected.numbers, REFIT)?;
-            let Selection { rivals, stages, declined, leftover, steps, .. } = selected;
-            return Ok(Selection { rivals, stages, declined, leftover, steps: steps + fitted.steps, ..fitted });
+            selected.steps += fitted.steps;
+            selected.go_on_as(fitted);
+            return Ok(selected);
         }
         for component in &mut selected.components {
             let other = base.components.iter().find(|other| other.joints == component.joints);

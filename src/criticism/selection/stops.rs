@@ -57,8 +57,7 @@ impl Selector<'_> {
             current.steps += without.steps;
             tracing::debug!(?stop, loss = current.log_evidence - without.log_evidence, "without");
             if without.log_evidence > current.log_evidence - STOP_GAIN {
-                let Selection { rivals, stages, declined, leftover, steps, .. } = current.clone();
-                *current = Selection { rivals, stages, declined, leftover, steps, ..without };
+                current.go_on_as(without);
             }
         }
         Ok(())

@@ -275,10 +275,14 @@ impl JointModel {
         self.effect_offset(self.effects.len()) + before
     }
 
+    /// Whether friction and damping by direction stand in the place of the declared ones.
+    fn resists_by_direction(&self) -> bool {
+        self.effects.iter().any(|effect| effect.kind == EffectKind::AsymmetricFriction)
+    }
+
     /// The numbers that the equations of motion hold.
     pub fn active(&self) -> Vec<usize> {
-        // Friction and damping by direction stand in the place of the declared ones.
-        let by_direction = self.effects.iter().any(|effect| effect.kind == EffectKind::AsymmetricFriction);
+        let by_direction = self.resists_by_direction();
         let mut active = vec![INERTIA];
         if !by_direction {
             active.push(DAMPING);
@@ -449,7 +453,7 @@ impl Mechanism {
     pub fn values(&self, joint: usize, x: &[f64]) -> BTreeMap<String, f64> {
         let (model, first) = (&self.joints[joint], self.offset(joint));
         let mut values = BTreeMap::from([("inertia".to_owned(), x[first + INERTIA].exp())]);
-        let by_direction = model.effects.iter().any(|effect| effect.kind == EffectKind::AsymmetricFriction);
+        let by_direction = model.resists_by_direction();
         if !by_direction {
             values.insert("damping".to_owned(), x[first + DAMPING].exp());
         }
