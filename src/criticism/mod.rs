@@ -207,7 +207,9 @@ impl Critic {
                 findings.effects = published.1;
                 published.0
             } else if self.adopted {
-                Some(taken_over(&workshop, batch, &selected, &BTreeSet::new())?.0)
+                let is_stop = |a: &&Addition| matches!(a, Addition::Stop(..));
+                let stops = selected.additions.iter().filter(is_stop).copied().collect();
+                Some(taken_over(&workshop, batch, &selected, &stops)?.0)
             } else {
                 None
             };

@@ -15,7 +15,7 @@ use crate::types::pairs;
 /// One effect beyond the declared model; joints by index in the fit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum Addition {
-    /// An end stop, lower or upper: part of the declared physics, once it is reached.
+    /// An end stop, lower or upper: part of the base, once it is reached.
     Stop(usize, bool),
     /// Coulomb friction, where it was not declared.
     Friction(usize),
@@ -83,6 +83,11 @@ pub struct Workshop<'a> {
 }
 
 impl Workshop<'_> {
+    /// The end stops that the learner believes.
+    pub fn stops(&self) -> BTreeSet<Addition> {
+        self.learner.stops().into_iter().map(|(joint, upper)| Addition::Stop(joint, upper)).collect()
+    }
+
     /// The hypothesis that has `additions`, and no more.
     pub fn hypothesis(&self, additions: &BTreeSet<Addition>) -> Result<Hypothesis, Failure> {
         let mut mechanism = self.learner.declared_mechanism();
@@ -114,7 +119,8 @@ impl Workshop<'_> {
         }
         let biased = additions.contains(&Addition::Bias);
         let mut hypothesis = self.learner.hypothesis(mechanism, self.rest_prior.as_ref().filter(|_| biased))?;
-        for addition in additions {
+        // Those that the learner believes have their prior.
+        for addition in additions.difference(&self.stops()) {
             if let Addition::Stop(joint, upper) = *addition {
                 let (low, high) = self.range(joint);
                 let end = if upper { high } else { low };

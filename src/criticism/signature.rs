@@ -14,7 +14,7 @@ use rayon::prelude::*;
 use super::numbers::{Addition, Workshop};
 use crate::inference::Failure;
 use crate::mechanism::effects::{EffectKind, Scales, TableKind};
-use crate::model::{AddedTable, BatchFit, BatchWindow, Hypothesis, JointScales, SENSOR_SIZE, SIZE};
+use crate::model::{AddedTable, BatchFit, BatchWindow, Hypothesis, JointScales, SENSOR_SIZE, SIZE, carriers};
 
 /// Spacing of nodes over time \[s\].
 const TIME_SPACING: f64 = 0.15;
@@ -37,6 +37,8 @@ pub struct Ranked {
 pub struct Probes {
     /// The joint; none for the sensor's.
     joint: Option<usize>,
+    /// Whether it moves while one that carries it does.
+    carried: bool,
     scales: JointScales,
     duration_s: f64,
     tables: Vec<(TableKind, Vec<f64>, usize)>,
@@ -124,6 +126,9 @@ pub fn probes(
     let hessian = hessian.view((m, m), (extra.len(), extra.len())) - cross.transpose() * &solved;
     let gradient = gradient.rows(m, extra.len()) - solved.transpose() * base_gradient;
     let duration_s = workshop.duration_s();
+    let carriers: Vec<usize> = carriers(&workshop.fit.joints, joint).collect();
+    let moves_carried = |w: &&BatchWindow| w.moving.contains(&joint) && w.moving.iter().any(|j| carriers.contains(j));
+    let carried = windows.iter().any(moves_carried);
     let mut tables = Vec::new();
     for t in own..model_of.tables.len() {
         let first = mechanism.offset(joint) + model_of.table_offset(t);
@@ -142,9 +147,18 @@ pub fn probes(
     let (joint_hessian, joint_gradient) = part(&(0..of_tables).collect::<Vec<usize>>());
     let (sensor_hessian, sensor_gradient) = part(&of_sensor);
     Ok([
-        Probes { joint: Some(joint), scales, duration_s, tables, hessian: joint_hessian, gradient: joint_gradient },
+        Probes {
+            joint: Some(joint),
+            carried,
+            scales,
+            duration_s,
+            tables,
+            hessian: joint_hessian,
+            gradient: joint_gradient,
+        },
         Probes {
             joint: None,
+            carried,
             scales,
             duration_s,
             tables: Vec::new(),
@@ -424,6 +438,13 @@ impl Probes {
             }
             EffectKind::Drag => {
                 offer(&[self.rate_force(|v| -v * v.abs())], &|a| (a[0] > 0.0).then(|| vec![a[0]]));
+            }
+            // Of a joint that nothing moving carries it is part of the inertia.
+            EffectKind::ReflectedInertia if !self.carried => {}
+            EffectKind::ReflectedInertia => {
+                offer(&[self.signature(TableKind::InertiaOverPosition, |_| 1.0)], &|a| {
+                    (a[0] > 0.0).then(|| vec![a[0] / scales.rate])
+                });
             }
             EffectKind::GravityOffset => offer(&[self.force(|_| 1.0)], &|a| Some(vec![a[0]])),
             EffectKind::Impulse => {

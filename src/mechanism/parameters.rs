@@ -1,4 +1,4 @@
-//! What a joint does by itself: damping, Coulomb friction, extra inertia, limits, effects.
+//! What a joint does by itself: damping, Coulomb friction, limits, effects.
 
 use super::effects::{AttachedEffect, AttachedTable, JointState};
 use super::friction::FrictionBounds;
@@ -12,8 +12,6 @@ pub struct JointParameters<T: Real> {
     pub damping: T,
     /// Coulomb friction F: λ ∈ [−F, F] against the motion \[N or N·m\].
     pub friction: T,
-    /// Inertia added to the diagonal of M, of nothing that the tree carries \[kg or kg·m²\].
-    pub armature: T,
     /// The least position, if there is one \[m or rad\].
     pub lower: Option<Limit<T>>,
     /// The greatest position, if there is one \[m or rad\].
@@ -44,15 +42,12 @@ pub struct JointForces<T: Real> {
 impl<T: Real> JointParameters<T> {
     /// Damping \[N·s/m or N·m·s/rad\] and Coulomb friction \[N or N·m\], and nothing else.
     pub fn new(damping: T, friction: T) -> Self {
-        Self {
-            damping,
-            friction,
-            armature: T::zero(),
-            lower: None,
-            upper: None,
-            effects: Vec::new(),
-            tables: Vec::new(),
-        }
+        Self { damping, friction, lower: None, upper: None, effects: Vec::new(), tables: Vec::new() }
+    }
+
+    /// Inertia added to the diagonal of M, of nothing that the tree carries \[kg or kg·m²\].
+    pub fn armature(&self) -> T {
+        self.effects.iter().fold(T::zero(), |inertia, effect| inertia + effect.armature())
     }
 
     /// All that the joint does at this state.

@@ -76,7 +76,7 @@ impl<T: Real> SingleJoint<T> {
         } else {
             Gravity::Constant(screw.linear.dot(&g) * lumped.mass)
         };
-        Some(Self { body, screw, inertia: screw.dot(&momentum) + joint.parameters.armature, gravity })
+        Some(Self { body, screw, inertia: screw.dot(&momentum) + joint.parameters.armature(), gravity })
     }
 
     /// The generalized force of gravity at q \[N or N·m\].

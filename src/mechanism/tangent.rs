@@ -203,7 +203,7 @@ fn step_with_slopes(
             right[(k, c)] += law.gained(&moved.forces(&joint), &forces, parameter.by);
             // Inertia of the joint's own, as of a gear.
             let acceleration = (law.rates[1] - law.rates[0]) / h;
-            right[(k, c)] -= h * acceleration * (moved.armature - own.armature) / parameter.by;
+            right[(k, c)] -= h * acceleration * (moved.armature() - own.armature()) / parameter.by;
         }
     }
     let half = 0.5 * h;
@@ -465,7 +465,7 @@ mod tests {
     use crate::mechanism::effects::{AttachedEffect, EffectKind};
     use crate::mechanism::{Body, JointParameters, JointType, Limit, WrenchSample, rollout};
 
-    const PARAMETERS: usize = 7;
+    const PARAMETERS: usize = 8;
     const SPAN_S: [f64; 2] = [0.0, 0.06];
     const STEP_S: f64 = 0.008;
 
@@ -480,8 +480,10 @@ mod tests {
             let turns = x[4] > 0.0;
             let mut parameters = JointParameters::new(0.6 + by[2], 0.3 + by[3] * k as f64);
             parameters.lower = stop.filter(|_| k == 0).map(|stop| Limit::at(stop + by[4]));
-            if k == 2 {
-                parameters.effects.push(AttachedEffect::new(EffectKind::Spring, &[3.0 + by[4], 0.2]));
+            match k {
+                1 => parameters.effects.push(AttachedEffect::new(EffectKind::ReflectedInertia, &[0.2 + by[7]])),
+                2 => parameters.effects.push(AttachedEffect::new(EffectKind::Spring, &[3.0 + by[4], 0.2])),
+                _ => {}
             }
             Body {
                 joint: if turns { JointType::Revolute } else { JointType::Prismatic },

@@ -168,7 +168,7 @@ proptest! {
         let tree: Tree<f64> = tree_of(&x[..11], &[None], &Pose::identity(), GRAVITY);
         let mut body = tree.bodies()[0].clone();
         body.parameters = JointParameters::new(0.6, 0.8);
-        body.parameters.armature = 0.1;
+        body.parameters.effects.push(effects::AttachedEffect::new(effects::EffectKind::ReflectedInertia, &[0.1]));
         body.parameters.upper = limited.then(|| Limit::at(0.1));
         body.parameters.effects.push(effects::AttachedEffect::new(effects::EffectKind::Drag, &[0.4]));
         let attached = Body { mass: 0.7, com_in_world: Vector3::x(), ..Body::rigid(Some(0)) };

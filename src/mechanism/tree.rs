@@ -217,7 +217,7 @@ impl<T: Real> Tree<T> {
         mass_matrix.fill(T::zero());
         for k in (0..n).rev() {
             let momentum = composites[k].momentum(&screws[k]);
-            mass_matrix[k * n + k] = screws[k].dot(&momentum) + self.bodies[self.moving[k]].parameters.armature;
+            mass_matrix[k * n + k] = screws[k].dot(&momentum) + self.bodies[self.moving[k]].parameters.armature();
             let mut ancestor = self.parents[k];
             if let Some(parent) = ancestor {
                 let composite = composites[k];

@@ -14,5 +14,7 @@ pub use dynamics::{
 pub use edges::{
     EdgeFit, EdgePart, axes_from_motion, moving_evidence, nearest_position, relative_windows, rigid_evidence,
 };
-pub use kinematics::{Axis, KinematicFit, KinematicJoint, KinematicSettings, SharedByFits, fit_edge, fit_kinematics};
+pub use kinematics::{
+    Axis, KinematicFit, KinematicJoint, KinematicSettings, SharedByFits, carriers, fit_edge, fit_kinematics,
+};
 pub use window::{Contact, PoseMeasurement, WindowObservations};

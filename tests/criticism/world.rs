@@ -358,10 +358,11 @@ impl Record {
             let inertia = match &object.undeclared {
                 Some(Undeclared::PositionDependentInertia(share)) => {
                     let slope = object.inertia * share / object.travel;
-                    parameters.armature = slope * q.max(0.0);
                     let rate = state.rates[0];
-                    let pull = AttachedEffect::new(EffectKind::GravityOffset, &[-0.5 * slope * rate * rate]);
-                    parameters.effects.push(pull);
+                    parameters.effects.extend([
+                        AttachedEffect::new(EffectKind::ReflectedInertia, &[slope * q.max(0.0)]),
+                        AttachedEffect::new(EffectKind::GravityOffset, &[-0.5 * slope * rate * rate]),
+                    ]);
                     object
                 }
                 Some(Undeclared::WarmUp(extra, distance)) => {

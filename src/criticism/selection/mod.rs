@@ -13,6 +13,7 @@ use serde::{Deserialize, Serialize};
 use super::numbers::{Addition, Numbers, Workshop};
 use super::rest::RestReadings;
 use crate::inference::Failure;
+use crate::math::median;
 use crate::model::{BatchFit, BatchWindow};
 use trials::Trial;
 
@@ -207,10 +208,14 @@ impl Selector<'_> {
     /// The declared physics with the end stops that the windows show.
     pub fn base(&self, numbers: &Numbers) -> Result<Selection, Failure> {
         let mut best: Option<Selection> = None;
+        let stops = self.workshop.stops();
+        let mut numbers = numbers.clone();
+        // Where the learner has them, not where an earlier review had.
+        numbers.added.retain(|addition, _| !stops.contains(addition));
         let mut bland = numbers.clone();
         bland.joints.clear();
         // The learner's numbers may be what a wrong model made of the windows.
-        for (start, scale) in FIRST_SCALES.into_iter().flat_map(|scale| [(numbers, scale), (&bland, scale)]) {
+        for (start, scale) in FIRST_SCALES.into_iter().flat_map(|scale| [(&numbers, scale), (&bland, scale)]) {
             let misfit = best.as_ref().is_none_or(|b| {
                 let fits = b.components.iter().filter_map(|c| c.fitted.as_ref());
                 fits.flat_map(|f| &f.windows).any(|w| w.reduction > 3.0 || w.noise_scale > 50.0)
@@ -218,7 +223,7 @@ impl Selector<'_> {
             if !misfit {
                 continue;
             }
-            if let Ok(fitted) = self.fitted_from(&BTreeSet::new(), start, scale, (10, 2))
+            if let Ok(fitted) = self.fitted_from(&stops, start, scale, (10, 2))
                 && best.as_ref().is_none_or(|b| fitted.log_evidence > b.log_evidence)
             {
                 best = Some(fitted);
@@ -226,6 +231,10 @@ impl Selector<'_> {
         }
         let mut current = best.ok_or(Failure::Diverged)?;
         self.settle(&mut current)?;
+        let usual = median(current.noise_scales_of(None));
+        if usual.is_some_and(|scale| scale >= MISFIT) {
+            self.drop_stops(&mut current)?;
+        }
         self.add_stops(&mut current);
         // Noise that a window was given for want of a stop need not be there any more.
         if current.noise_scales_of(None).into_iter().any(|scale| scale >= MISFIT)

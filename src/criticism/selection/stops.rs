@@ -14,14 +14,12 @@ const HALT_S: f64 = 0.2;
 impl Selector<'_> {
     /// Adds the end stops that the windows show by a model: what it lacks may hide them.
     pub(super) fn add_stops(&self, current: &mut Selection) {
-        let declared = self.workshop.learner.declared_mechanism();
         for component in current.components.clone() {
             for &joint in &component.joints {
                 let moved = component.windows.iter().any(|&w| self.batch[w].moving.contains(&joint));
                 for upper in [false, true].into_iter().filter(|_| moved) {
                     let stop = Addition::Stop(joint, upper);
-                    let known = declared.joints[joint].stops[usize::from(upper)] || current.additions.contains(&stop);
-                    if known || !self.may_halt(joint, upper) {
+                    if current.additions.contains(&stop) || !self.may_halt(joint, upper) {
                         continue;
                     }
                     let (low, high) = self.workshop.range(joint);
@@ -47,7 +45,7 @@ impl Selector<'_> {
     }
 
     /// Drops the end stops that the windows call for no more: what was lacking may have looked like one.
-    fn drop_stops(&self, current: &mut Selection) -> Result<(), Failure> {
+    pub(super) fn drop_stops(&self, current: &mut Selection) -> Result<(), Failure> {
         let is_stop = |a: &&Addition| matches!(a, Addition::Stop(..));
         let stops: Vec<Addition> = current.additions.iter().filter(is_stop).copied().collect();
         for stop in stops {
@@ -107,8 +105,6 @@ impl Selector<'_> {
         let (low, high) = self.workshop.range(joint);
         let upper = scales.travel < 0.0;
         let end = if upper { high } else { low };
-        let declared = self.workshop.learner.declared_mechanism();
-        let new = !declared.joints[joint].stops[usize::from(upper)] && end.abs() < 0.05 * scales.travel.abs();
-        new.then_some(Addition::Stop(joint, upper))
+        (end.abs() < 0.05 * scales.travel.abs()).then_some(Addition::Stop(joint, upper))
     }
 }

@@ -20,7 +20,7 @@ const WIDENED: f64 = 30.0;
 /// A delay is tried from these \[scales\] and from what its signature says: the motion's dependence on it is far
 /// from linear.
 const DELAYS: [f64; 4] = [-0.8, 0.3, 1.0, 2.0];
-/// Beside friction that is not known yet a signature says little of it: it is tried from either side of none.
+/// That of motors' torques is tried from either side of none [scales].
 const NEAR_DELAYS: [f64; 2] = [-0.1, 0.1];
 /// Linearizations where several joints move and candidates are only glanced at.
 pub(super) const GLANCE: (usize, usize) = (4, 1);
@@ -101,6 +101,11 @@ impl Selector<'_> {
             from_both().chain(wide)
         };
         let starts: Vec<(Selection, Ranked)> = match candidate.addition {
+            // Motors' torques are late by little.
+            Addition::Delay if candidate.also.is_empty() && self.several() => {
+                let delays = NEAR_DELAYS.into_iter().chain(candidate.start.first().copied());
+                alone(delays.map(|delay| (current, delay)).collect())
+            }
             Addition::Delay if candidate.also.is_empty() => {
                 let delays = || DELAYS.into_iter().chain(candidate.start.first().copied());
                 alone([current, &bland].into_iter().flat_map(|from| delays().map(move |d| (from, d))).collect())

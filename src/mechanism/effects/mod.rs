@@ -11,6 +11,7 @@ mod gravity_offset;
 mod impulse;
 mod parameter;
 mod position_friction;
+mod reflected_inertia;
 mod self_closing;
 mod soft_close;
 mod spring;
@@ -25,6 +26,7 @@ pub use gravity_offset::GravityOffset;
 pub use impulse::Impulse;
 pub use parameter::{Dimension, Parameter, Prior, Scales};
 pub use position_friction::PositionFriction;
+pub use reflected_inertia::ReflectedInertia;
 pub use self_closing::SelfClosing;
 pub use soft_close::SoftClose;
 pub use spring::Spring;
@@ -80,6 +82,11 @@ pub trait Effect {
     ) -> FrictionBounds<T> {
         declared
     }
+
+    /// Inertia added to the diagonal of M, of nothing that the tree carries \[kg or kg·m²\].
+    fn armature<T: Real>(_parameters: &[T]) -> T {
+        T::zero()
+    }
 }
 
 macro_rules! effect_kinds {
@@ -113,6 +120,10 @@ macro_rules! effect_kinds {
                 match self { $(Self::$kind => $kind::damping(parameters, joint, declared),)* }
             }
 
+            fn armature<T: Real>(self, parameters: &[T]) -> T {
+                match self { $(Self::$kind => $kind::armature(parameters),)* }
+            }
+
             fn friction_bounds<T: Real>(
                 self,
                 parameters: &[T],
@@ -139,6 +150,7 @@ effect_kinds!(
     PositionFriction,
     GravityOffset,
     Impulse,
+    ReflectedInertia,
 );
 
 /// An effect on one joint, with its parameters and the direction that counts as opening.
@@ -182,6 +194,11 @@ impl<T: Real> AttachedEffect<T> {
             damping: self.kind.damping(&self.parameters, &opening, forces.damping),
             friction: if self.reversed { friction.reversed() } else { friction },
         }
+    }
+
+    /// Inertia that it adds to the diagonal of M \[kg or kg·m²\].
+    pub fn armature(&self) -> T {
+        self.kind.armature(&self.parameters)
     }
 
     /// What the effect adds to the generalized force on a joint that moves \[N or N·m\], damping

@@ -69,12 +69,22 @@ impl DynamicsLearner {
         })
     }
 
-    /// The joints with what was declared of them and nothing else.
+    /// The end stops that are believed: by joint, lower or upper.
+    pub fn stops(&self) -> Vec<(usize, bool)> {
+        let of = |(joint, model): (usize, &JointModel)| {
+            let sides = [false, true].into_iter().zip(model.stops).filter(|(_, there)| *there);
+            sides.map(|(upper, _)| (joint, upper)).collect::<Vec<_>>()
+        };
+        self.mechanism.joints.iter().enumerate().flat_map(of).collect()
+    }
+
+    /// The joints with what was declared of them and nothing else: without end stops, which motion has to show.
     pub fn declared_mechanism(&self) -> Mechanism {
         let mut mechanism = self.mechanism.clone();
         mechanism.sensor.bias = false;
         mechanism.sensor.delay = false;
         for model in &mut mechanism.joints {
+            model.stops = [false; 2];
             model.friction = self.declared.friction;
             model.effects.truncate(self.declared.effects.len());
             model.tables.clear();

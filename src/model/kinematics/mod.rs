@@ -225,6 +225,11 @@ impl KinematicFit {
     }
 }
 
+/// The joints that carry a joint, its own not among them.
+pub fn carriers(joints: &[KinematicJoint], joint: usize) -> impl Iterator<Item = usize> {
+    std::iter::successors(joints[joint].parent, |&j| joints[j].parent)
+}
+
 /// Displacements of all children, parents first in the list.
 fn forward(joints: &[KinematicJoint], position: impl Fn(usize) -> f64) -> Vec<Pose> {
     let mut displacements: Vec<Pose> = Vec::with_capacity(joints.len());

@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 
 use nalgebra::{DMatrix, DVector};
 
+use super::carriers;
 use super::equations::WindowSystem;
 use super::problem::Problem;
 
@@ -30,7 +31,7 @@ impl Problem<'_> {
             let rests = |j: usize| self.slots[w][j].windows(2).all(|pair| pair[0] == pair[1]);
             let frames = self.windows[w].times_s.len();
             let moved = (0..self.joints.len()).filter(|&j| !rests(j));
-            let loaded: BTreeSet<usize> = moved.flat_map(|j| self.carriers(j)).filter(|&j| rests(j)).collect();
+            let loaded: BTreeSet<usize> = moved.flat_map(|j| carriers(&self.joints, j)).filter(|&j| rests(j)).collect();
             for j in loaded {
                 let mut trial = self.clone();
                 let block = frames.div_ceil(REST_BLOCKS);
@@ -49,11 +50,6 @@ impl Problem<'_> {
             self.slot_counts[w] += frames;
         }
         !freed.is_empty()
-    }
-
-    /// The joints that carry a joint, its own not among them.
-    fn carriers(&self, joint: usize) -> impl Iterator<Item = usize> {
-        std::iter::successors(self.joints[joint].parent, |&j| self.joints[j].parent)
     }
 
     /// Makes frames in which a joint rests one unknown: friction holds what is not pushed.
