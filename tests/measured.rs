@@ -7,7 +7,16 @@ mod command;
 use std::{fs, path::Path};
 
 use bayesian_object_models::io::document::PosteriorDocument;
+use bayesian_object_models::math::Screw;
+use bayesian_object_models::mechanism::effects::{AttachedEffect, EffectKind};
+use bayesian_object_models::mechanism::{
+    Body, JointParameters, JointType, State, Tree, WrenchSample, WrenchTrack, rollout,
+};
 use command::{bom, measured, ours};
+use nalgebra::{Matrix3, Vector3};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::StandardNormal;
 use serde_json::Value;
 
 fn text(path: &Path) -> &str {
@@ -154,6 +163,77 @@ fn motors_rub_and_answer_late() {
     }
     // An offset is none of it.
     assert!(ladder.iter().all(|(effects, _)| !has(effects, "gravity_offset")), "{ladder:?}");
+}
+
+/// Reflected inertia of the second motor \[kg·m²\], friction of both \[N·m\].
+const MOTORS: (f64, [f64; 2]) = (0.006, [0.25, 0.19]);
+
+/// A record of two links in a chain as the double pendulum's are, its motors geared.
+fn geared_pendulum() -> String {
+    let link = |k: usize| {
+        let at = Vector3::new(0.0, 0.0, -0.2 * k as f64);
+        let (mass, com, about_com) = [(0.6, -0.06, 0.018), (0.8, -0.2, 0.016)][k];
+        let mut parameters = JointParameters::new(0.003, MOTORS.1[k]);
+        if k == 1 {
+            parameters.effects.push(AttachedEffect::new(EffectKind::ReflectedInertia, &[MOTORS.0]));
+        }
+        Body {
+            joint: JointType::Revolute,
+            screw: Screw::revolute(&Vector3::y(), &at),
+            mass,
+            com_in_world: at + Vector3::new(0.0, 0.0, com),
+            inertia_about_com: Matrix3::identity() * about_com,
+            parameters,
+            ..Body::rigid(k.checked_sub(1))
+        }
+    };
+    let tree = Tree::new(vec![link(0), link(1)], Vector3::new(0.0, 0.0, -9.81)).unwrap();
+    let torques = |t: f64| [0.6 * (2.5 * t).sin(), 0.5 * (3.7 * t + 0.5).sin()];
+    let times: Vec<f64> = (0..2500).map(|k| 0.004 * f64::from(k)).collect();
+    // The second motor stands on the first link.
+    let acting = |k: usize| -> Vec<WrenchSample> {
+        let torque = |t: f64| if k == 0 { torques(t)[0] - torques(t)[1] } else { torques(t)[1] };
+        let sample = |&stamp_s: &f64| WrenchSample {
+            stamp_s,
+            point_in_world: Vector3::zeros(),
+            force_in_world: Vector3::zeros(),
+            torque_in_world: Vector3::y() * torque(stamp_s),
+        };
+        times.iter().map(sample).collect()
+    };
+    let (first, second) = (acting(0), acting(1));
+    let tracks = [WrenchTrack::new(0, &first), WrenchTrack::new(1, &second)];
+    let run = rollout(&tree, &State::new(vec![0.0; 2], vec![0.0; 2]), &tracks, &times, 1e-3).unwrap();
+    let mut rng = ChaCha8Rng::seed_from_u64(7);
+    let mut table = "t_s,q1_rad,q2_rad,tau1_commanded_Nm,tau2_commanded_Nm\n".to_owned();
+    for (k, t) in times.iter().enumerate() {
+        let seen: Vec<f64> = run.positions(k).iter().map(|q| q + 3e-4 * rng.sample::<f64, _>(StandardNormal)).collect();
+        let [first, second] = torques(*t);
+        table += &format!("{t},{},{},{first},{second}\n", seen[0], seen[1]);
+    }
+    table
+}
+
+#[test]
+fn a_motor_behind_a_gear_is_told_from_its_link() {
+    let study = Study::new("double_pendulum");
+    let table = study.folder.path().join("geared.csv");
+    fs::write(&table, geared_pendulum()).unwrap();
+    study.import(&table, "double_pendulum", "fit.mcap", &[]);
+    let criticism = study.learn("fit.mcap", &[]).posterior.criticism;
+    let found = |name: &str, label: u32| {
+        let effect = criticism.effects.iter().find(|e| e.name == name && e.label.is_some_and(|l| l.0 == label));
+        effect.unwrap_or_else(|| panic!("{name} on {label}: {criticism:?}"))
+    };
+    assert_eq!(criticism.effects.len(), 3, "friction of both, the motor and nothing else: {criticism:?}");
+    let motor = &found("reflected_inertia", 2).parameters["inertia"];
+    assert!(motor.q05 < MOTORS.0 && MOTORS.0 < motor.q95 && motor.q95 < 1.2 * motor.q05, "{motor:?}");
+    for (label, truth) in (1..).zip(MOTORS.1) {
+        let effect = found("friction", label);
+        let friction = &effect.parameters["friction"];
+        assert!(effect.probability > 0.9, "{effect:?}");
+        assert!(friction.q05 < truth && truth < friction.q95, "{label}: {friction:?}");
+    }
 }
 
 #[test]

@@ -123,7 +123,8 @@ impl Selector<'_> {
             let whole = whole.map(|trial| (current.log_evidence + trial.gain, trial.clone()));
             let mut rivals: Vec<(Option<Addition>, f64)> = trials
                 .iter()
-                .filter(|t| t.addition != best.addition && same_place(t.addition, best.addition))
+                // What has it, too, is none.
+                .filter(|t| !t.additions.contains(&best.addition) && same_place(t.addition, best.addition))
                 .map(|t| (Some(t.addition), t.gain - best.gain))
                 .collect();
             rivals.push((None, -best.gain));

@@ -253,8 +253,10 @@ impl Selector<'_> {
         self.batch.iter().any(|window| window.moving.len() > 1)
     }
 
+    /// Every joint that moves with others has candidates of its own.
     fn budget(&self) -> usize {
-        BUDGET * self.weight(&(0..self.batch.len()).collect::<Vec<usize>>())
+        let together = self.batch.iter().map(|window| window.moving.len()).max().unwrap_or(1);
+        BUDGET * together * self.weight(&(0..self.batch.len()).collect::<Vec<usize>>())
     }
 
     /// Fits a model on until that gains nothing more: else whatever is added next gains what was left to find
