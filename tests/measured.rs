@@ -1,5 +1,5 @@
 //! Criticism on the public records beside this repository: what it finds from rigid bodies and viscous damping
-//! on one part of a record, and what that leaves unexplained on another.
+//! on one part of a record, and what that leaves unexplained on another. And on a simulated pendulum, where the truth is known.
 #![allow(clippy::unwrap_used)]
 
 mod command;

@@ -317,8 +317,8 @@ fn a_recording_has_what_was_taken_and_said_and_replays_to_the_same() {
     let live_spans = since_first(serde_json::from_value(seen["spans"].clone()).unwrap());
     let replayed_spans = since_first(posterior["windows"].as_array().unwrap().iter().map(span).collect());
     let farthest = live_spans.as_flattened().iter().zip(replayed_spans.as_flattened()).map(|(a, b)| (a - b).abs());
-    let elsewhere = "windows end elsewhere:";
-    assert!(farthest.fold(0.0, f64::max) < 1e-6, "{elsewhere} {live_spans:?} {replayed_spans:?}\n{note}");
+    let spans = format!("{live_spans:?} {replayed_spans:?}");
+    assert!(farthest.fold(0.0, f64::max) < 1e-6, "windows end elsewhere: {spans}\n{note}");
     for edge in posterior["edges"].as_array().unwrap() {
         let Some(medians) = seen["medians"].get(edge["child"].to_string()) else { continue };
         if edge["probability"].as_f64().unwrap() <= 0.5 {

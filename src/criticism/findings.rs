@@ -23,7 +23,7 @@ pub fn effects(
     fit: &KinematicFit,
 ) -> Vec<EffectPosterior> {
     let mut found: Vec<(f64, EffectPosterior)> = Vec::new();
-    for addition in selection.additions.iter().filter(|a| !matches!(a, Addition::Stop(..))) {
+    for addition in selection.additions.iter().filter(|a| !a.is_stop()) {
         let rivals = selection.rivals.get(addition).map_or(&[][..], Vec::as_slice);
         let total: f64 = 1.0 + rivals.iter().map(|(_, difference)| difference.exp()).sum::<f64>();
         let likely = rivals.iter().filter(|(_, difference)| difference.exp() / total > NAMED);

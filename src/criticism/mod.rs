@@ -207,8 +207,7 @@ impl Critic {
                 findings.effects = published.1;
                 published.0
             } else if self.adopted {
-                let is_stop = |a: &&Addition| matches!(a, Addition::Stop(..));
-                let stops = selected.additions.iter().filter(is_stop).copied().collect();
+                let stops = selected.additions.iter().filter(|a| a.is_stop()).copied().collect();
                 Some(taken_over(&workshop, batch, &selected, &stops)?.0)
             } else {
                 None
@@ -260,7 +259,7 @@ impl Critic {
         }
         let stage = |selection: Selection| {
             let hypothesis = workshop.hypothesis(&selection.additions)?;
-            let named = selection.additions.iter().filter(|a| !matches!(a, Addition::Stop(..)));
+            let named = selection.additions.iter().filter(|a| !a.is_stop());
             let effects = named.map(|a| (a.joint().map(|joint| fit.joints[joint].child), a.name())).collect();
             let mut x = selection.numbers.laid_out(&hypothesis, &selection.additions);
             // A model that lacks something explains some windows by chance, which would then count for all.

@@ -40,6 +40,11 @@ impl Addition {
         }
     }
 
+    /// Whether it is an end stop, which is no effect.
+    pub fn is_stop(&self) -> bool {
+        matches!(self, Self::Stop(..))
+    }
+
     /// The name used in files.
     pub fn name(self) -> &'static str {
         match self {

@@ -158,7 +158,7 @@ pub fn probes(
         },
         Probes {
             joint: None,
-            carried,
+            carried: false,
             scales,
             duration_s,
             tables: Vec::new(),
@@ -440,8 +440,10 @@ impl Probes {
                 offer(&[self.rate_force(|v| -v * v.abs())], &|a| (a[0] > 0.0).then(|| vec![a[0]]));
             }
             // Of a joint that nothing moving carries it is part of the inertia.
-            EffectKind::ReflectedInertia if !self.carried => {}
             EffectKind::ReflectedInertia => {
+                if !self.carried {
+                    return None;
+                }
                 offer(&[self.signature(TableKind::InertiaOverPosition, |_| 1.0)], &|a| {
                     (a[0] > 0.0).then(|| vec![a[0] / scales.rate])
                 });

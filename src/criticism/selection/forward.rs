@@ -205,7 +205,7 @@ impl Selector<'_> {
     /// The model `had` before the newest addition, fitted anew from where that led, if it does as well but for
     /// this much evidence.
     fn as_good_without(&self, current: &Selection, had: &Selection, least: f64) -> Result<Option<Selection>, Failure> {
-        let stops = current.additions.iter().filter(|a| matches!(a, Addition::Stop(..)));
+        let stops = current.additions.iter().filter(|a| a.is_stop());
         let additions: BTreeSet<Addition> = had.additions.iter().chain(stops).copied().collect();
         let mut numbers = current.numbers.clone();
         // What the newest took the place of is as it was.
@@ -224,8 +224,8 @@ impl Selector<'_> {
 
     /// After a right effect is in, one that stood in for it may go.
     pub(super) fn drop_what_is_not_needed(&self, current: &mut Selection, newest: Addition) -> Result<(), Failure> {
-        let is_stop = |a: &Addition| matches!(a, Addition::Stop(..));
-        let others: Vec<Addition> = current.additions.iter().copied().filter(|a| *a != newest && !is_stop(a)).collect();
+        let others: Vec<Addition> =
+            current.additions.iter().copied().filter(|a| *a != newest && !a.is_stop()).collect();
         for addition in others
             .into_iter()
             .filter(|a| a.joint().is_none() || newest.joint().is_none() || a.joint() == newest.joint())

@@ -374,7 +374,7 @@ impl Selector<'_> {
     /// The model before the last addition, fitted anew; none where what was added took the place of something.
     pub fn before_last(&self, selected: &Selection) -> Option<Selection> {
         let [earlier @ .., before, _] = &selected.stages[..] else { return None };
-        let known = |a: &Addition| matches!(a, Addition::Stop(..)) || selected.rivals.contains_key(a);
+        let known = |a: &Addition| a.is_stop() || selected.rivals.contains_key(a);
         if !before.additions.iter().all(known) {
             return None;
         }

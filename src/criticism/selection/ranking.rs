@@ -44,7 +44,7 @@ impl Selector<'_> {
             let known =
                 self.found.into_iter().flatten().filter(|a| a.joint().is_none_or(|joint| moved.contains(&joint)));
             // A table may stand for anything: it describes what is left where nothing with a name does.
-            let named = |a: &&Addition| !matches!(a, Addition::Stop(..) | Addition::Table(..));
+            let named = |a: &&Addition| !a.is_stop() && !matches!(a, Addition::Table(..));
             let known = known.filter(|a| !current.additions.contains(a)).filter(named);
             for addition in known.copied() {
                 let start = current.numbers.added.get(&addition).cloned().unwrap_or_default();

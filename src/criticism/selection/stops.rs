@@ -46,8 +46,7 @@ impl Selector<'_> {
 
     /// Drops the end stops that the windows call for no more: what was lacking may have looked like one.
     pub(super) fn drop_stops(&self, current: &mut Selection) -> Result<(), Failure> {
-        let is_stop = |a: &&Addition| matches!(a, Addition::Stop(..));
-        let stops: Vec<Addition> = current.additions.iter().filter(is_stop).copied().collect();
+        let stops: Vec<Addition> = current.additions.iter().filter(|a| a.is_stop()).copied().collect();
         for stop in stops {
             let mut fewer = current.additions.clone();
             fewer.remove(&stop);
