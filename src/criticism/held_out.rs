@@ -8,8 +8,11 @@ use crate::inference::Failure;
 use crate::math::median;
 use crate::model::{BatchWindow, Hypothesis};
 
-/// Parts that the windows of a component are left out in, at most.
+/// Parts that the windows of a component are left out in, at most; of several
+/// streams whole ones are left out, as what is the same within one may be another in the next.
 const FOLDS: usize = 4;
+/// From so many streams on: what is left of two says too little by itself.
+const SEVERAL: usize = 3;
 /// Linearizations of a fit to the windows that are kept: it starts where all windows have it.
 const STEPS: usize = 3;
 /// Positions are simulated this far \[s\].
@@ -17,12 +20,16 @@ const HORIZON_S: f64 = 0.5;
 /// By how much ln(force · position) may rise, the mean of all windows together, of which the worst weighs most, and
 /// of the usual one: an addition that acts in one window only changes the others by chance.
 const SLACK: f64 = 0.05;
+/// By how much it has to fall where streams are left out: what is of the object is there in every stream.
+const OF_STREAMS: f64 = 0.1;
 
 /// Squares of what windows left out lack.
 #[derive(Clone, Debug, Default)]
 pub struct HeldOut {
     /// By joint and window.
     lacks: BTreeMap<usize, BTreeMap<usize, Lack>>,
+    /// Whether whole streams were left out.
+    streams: bool,
     /// Linearizations of all windows spent.
     pub steps: usize,
 }
@@ -55,11 +62,20 @@ impl HeldOut {
         batch: &[BatchWindow],
     ) -> Result<(), Failure> {
         let whole = component.fitted.as_ref().ok_or(Failure::NoInformation)?;
-        let folds = component.windows.len().min(FOLDS);
+        let mut streams: Vec<usize> = component.windows.iter().map(|&w| batch[w].stream).collect();
+        streams.sort_unstable();
+        streams.dedup();
+        let whole_streams = streams.len() >= SEVERAL;
+        self.streams |= whole_streams;
+        let folds = if whole_streams { streams.len() } else { component.windows.len() }.min(FOLDS);
+        let fold_of = |k: usize, w: usize| match whole_streams {
+            true => streams.partition_point(|stream| *stream < batch[w].stream) % folds,
+            false => k % folds,
+        };
         for fold in (0..folds).filter(|_| folds > 1) {
             let (mut kept, mut scales, mut left_out) = (Vec::new(), Vec::new(), Vec::new());
             for (k, &w) in component.windows.iter().enumerate() {
-                if k % folds == fold {
+                if fold_of(k, w) == fold {
                     left_out.push(&batch[w]);
                 } else {
                     kept.push(&batch[w]);
@@ -77,7 +93,7 @@ impl HeldOut {
             self.steps += learned.steps * kept.len() + left_out.len();
             let usual = median(scales).ok_or(Failure::NoInformation)?;
             for window in left_out {
-                let residual = hypothesis.window(window, usual).residual(&learned.x, HORIZON_S)?;
+                let residual = hypothesis.window(window, usual).residual(&learned.x, HORIZON_S, 0.0)?;
                 for (column, joint) in window.moving.iter().enumerate() {
                     let squares = residual.forces.iter().map(|(_, span, force)| span * force[column].powi(2));
                     let lack = Lack { force: squares.sum(), position: residual.squares[column].0 };
@@ -113,7 +129,8 @@ impl HeldOut {
 
     /// Whether windows left out are simulated no worse than by another model, as far as these joints go.
     pub fn holds_against(&self, before: &Self, joints: &[usize]) -> bool {
-        self.ratios_to(before, joints).is_none_or(|[all, usual]| 0.5 * (all + usual) < SLACK)
+        let slack = if self.streams { -OF_STREAMS } else { SLACK };
+        self.ratios_to(before, joints).is_none_or(|[all, usual]| 0.5 * (all + usual) < slack)
     }
 }
 
@@ -134,7 +151,8 @@ mod tests {
         let windows = |own: &[f64]| {
             own.iter().map(|lack| Lack { force: lack * lack, position: lack * lack }).enumerate().collect()
         };
-        HeldOut { lacks: of_joints.iter().map(|(joint, own)| (*joint, windows(own))).collect(), steps: 0 }
+        let lacks = of_joints.iter().map(|(joint, own)| (*joint, windows(own))).collect();
+        HeldOut { lacks, ..HeldOut::default() }
     }
 
     #[test]

@@ -34,8 +34,9 @@ use score::{Scores, scores};
 const EVEN: (usize, usize) = (8, 0);
 /// κ of a window that keeps its own there, in units of the usual one's.
 const APART: f64 = 10.0;
-/// Windows of the same joints that are looked at together at most.
-const MOST_WINDOWS: usize = 8;
+/// Windows of the same joints that are looked at together at most: of one joint and of several, which have more
+/// numbers.
+const MOST_WINDOWS: (usize, usize) = (8, 12);
 /// Standard deviations of the sensor's errors by the prior: force \[N\], torque \[N·m\], delay \[s\].
 const SENSOR_SCALES: [f64; 3] = [1.0, 0.2, 0.05];
 
@@ -255,7 +256,9 @@ impl Critic {
             // From where it was found and from where all ended.
             let fits = [&step.numbers, &numbers].map(|start| selector.fitted(&step.additions, start, (12, 2)));
             let best = fits.into_iter().flatten().max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence));
-            selections.push(best.ok_or(Failure::Diverged)?);
+            let mut best = best.ok_or(Failure::Diverged)?;
+            selector.settle(&mut best)?;
+            selections.push(best);
         }
         let stage = |selection: Selection| {
             let hypothesis = workshop.hypothesis(&selection.additions)?;

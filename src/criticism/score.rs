@@ -145,7 +145,7 @@ fn sequence(
             let constant = 0.5 * with.windows[k].observations as f64 * std::f64::consts::TAU.ln();
             let log_density = with.log_evidence - learned.log_evidence - constant;
             let usual = median(scales[..k].to_vec()).ok_or(Failure::NoInformation)?;
-            let residual = hypothesis.window(window, usual).residual(&learned.x, HORIZON_S)?;
+            let residual = hypothesis.window(window, usual).residual(&learned.x, HORIZON_S, 0.0)?;
             scored.push(Scored { window: component.windows[k], log_density, residual });
         }
         learned = with;

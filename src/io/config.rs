@@ -163,6 +163,7 @@ impl Config {
             ("windows.quiet_s", self.windows.quiet_s),
             ("windows.longest_s", self.windows.longest_s),
             ("poses.rate_hz", self.poses.rate_hz),
+            ("poses.evaluation_rate_hz", self.poses.evaluation_rate_hz),
             ("kinematics.tool_offset_sigma", self.kinematics.tool_offset_sigma),
             ("kinematics.shared_error", self.kinematics.shared_error),
             ("kinematics.own_error", self.kinematics.own_error),

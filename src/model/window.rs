@@ -95,6 +95,9 @@ pub struct WindowObservations {
     pub contacts: Vec<Contact>,
     /// Every wrench reading, from before the window to after it.
     pub wrenches: Vec<AppliedWrench>,
+    /// Of how many streams the object had been learned before this window's.
+    #[serde(default)]
+    pub stream: usize,
 }
 
 impl WindowObservations {

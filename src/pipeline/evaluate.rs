@@ -20,6 +20,9 @@ use crate::types::{Label, Stamp};
 /// Points further from the surface where it is expected say nothing \[m\].
 const GATE: f64 = 0.02;
 
+/// Residual forces are means over this \[s\].
+const FORCE_SPAN_S: f64 = 0.04;
+
 /// Squares of one part's residuals under one model, summed over windows in which it moved.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PartScore {
@@ -83,7 +86,8 @@ impl Pipeline {
     ///
     /// # Errors
     /// If the settings contradict what was saved.
-    pub fn evaluate(settings: PipelineSettings, saved: SavedObject, horizon_s: f64) -> Result<Self, ResumeError> {
+    pub fn evaluate(mut settings: PipelineSettings, saved: SavedObject, horizon_s: f64) -> Result<Self, ResumeError> {
+        settings.poses.rate_hz = settings.poses.rate_hz.max(settings.poses.evaluation_rate_hz);
         let mut pipeline = Self::resume(settings, saved)?;
         pipeline.scoring = Some(Scoring { horizon_s, scores: Scores::default(), models: None });
         Ok(pipeline)
@@ -111,7 +115,8 @@ impl Scores {
         self.stages.resize_with(models.len(), StageScore::default);
         for (model, stage) in models.iter().zip(&mut self.stages) {
             stage.effects.clone_from(&model.effects);
-            let residual = model.hypothesis.window(window, model.noise_scale).residual(&model.x, horizon_s);
+            let residual =
+                model.hypothesis.window(window, model.noise_scale).residual(&model.x, horizon_s, FORCE_SPAN_S);
             match residual {
                 Ok(residual) => stage.add(model, &residual, window, learner),
                 Err(failure) => tracing::warn!(%failure, effects = ?model.effects, "a window is not scored"),
@@ -151,7 +156,7 @@ impl Learner {
         let Some(fit) = &self.fit else { return scores };
         let models = self.stages(zero);
         let windows: Vec<&WindowObservations> = self.windows.iter().collect();
-        for window in self.dynamics.batch(fit, &self.input(&windows, zero), usize::MAX) {
+        for window in self.dynamics.batch(fit, &self.input(&windows, zero), (usize::MAX, usize::MAX)) {
             scores.add(&models, &window, self, horizon_s);
         }
         scores

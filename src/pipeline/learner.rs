@@ -101,6 +101,9 @@ pub struct Learner {
     /// Time zero of the windows, once there is one.
     #[serde(skip)]
     zero: Option<crate::types::Stamp>,
+    /// Of how many streams the object had been learned before this one.
+    #[serde(default)]
+    pub streams: usize,
     /// Whether it was given: else it is what the evidence says, and may change.
     pub root_is_given: bool,
     /// A name for the world, for when it is none of the parts.
@@ -179,6 +182,7 @@ impl Learner {
             root,
             sampling: None,
             zero: None,
+            streams: 0,
             root_is_given: true,
             world: None,
             use_tool,
@@ -374,6 +378,7 @@ impl Learner {
             wrenches: job.wrenches.clone(),
             direct,
             poses,
+            stream: self.streams,
             ..WindowObservations::default()
         };
         for (label, motion) in &motions {

@@ -42,11 +42,13 @@ const RESTS_WITHIN: f64 = 0.0005;
 pub struct PoseSettings {
     /// Frames per second that poses are thinned out to, where no clouds set the pace \[Hz\].
     pub rate_hz: f64,
+    /// The same in `bom evaluate`, if it is more \[Hz\].
+    pub evaluation_rate_hz: f64,
 }
 
 impl Default for PoseSettings {
     fn default() -> Self {
-        Self { rate_hz: 25.0 }
+        Self { rate_hz: 25.0, evaluation_rate_hz: 25.0 }
     }
 }
 

@@ -172,6 +172,7 @@ impl Pipeline {
         for wrench in learner.windows.iter_mut().flat_map(|window| &mut window.wrenches) {
             wrench.stamp = Stamp(wrench.stamp.0 - old_zero.0 + zero.0);
         }
+        learner.streams += 1;
         let positions = learner.locate(frame);
         let unexplained = learner.unexplained(frame);
         let unknown = frame.scans.keys().filter(|label| !learner.models.contains_key(label));

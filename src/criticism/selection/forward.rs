@@ -48,7 +48,7 @@ impl Selector<'_> {
                 }
                 if let Ok(trial) = self.best_trial(&current, &candidate) {
                     current.steps += trial.spent;
-                    tracing::debug!(addition = ?trial.addition, first_order = candidate.gain, gain = trial.gain, "trial");
+                    tracing::debug!(addition = ?trial.addition, first_order = candidate.gain, gain = trial.gain, reduction = trial.reduction(), "trial");
                     trials.push(trial);
                 }
             }
@@ -75,17 +75,19 @@ impl Selector<'_> {
                 Addition::Effect(_, EffectKind::Impulse) => least + PLACES.ln(),
                 _ => least,
             };
+            // Of a chain what is left is seldom white: where innovations are not, fewer of them count.
+            let reduction = |trial: &Trial| if self.several() { trial.reduction() } else { 1.0 };
             let needs = |trial: &Trial| match trial.addition {
                 // It acts in one window: where others are not explained either, something acts in them all.
                 Addition::Effect(_, EffectKind::Impulse) if trial.usual_noise_scale() >= MISFIT => f64::INFINITY,
-                addition => needs_of(addition),
+                addition => needs_of(addition) * reduction(trial),
             };
             let Some(best) = trials.iter().find(|trial| trial.gain > needs(trial)).or(trials.first()) else { break };
             let part_of_it =
                 |trial: &&Trial| trial.gain > needs(trial).max(SIMPLER_SHARE * best.gain) && is_part_of(trial, best);
             let simple = trials.iter().find(part_of_it);
             // On a chain what one joint lacks shows in the others: of those that evidence hardly tells apart the one
-            // with the fewest numbers; where innovations are not white, fewer of them count.
+            // with the fewest numbers.
             let apart = if self.several() { LEAST_GAIN * best.reduction() } else { 0.0 };
             let near = trials.iter().filter(|trial| trial.gain > needs(trial).max(best.gain - apart));
             let best = simple.or_else(|| near.min_by_key(|trial| trial.numbers())).unwrap_or(best);

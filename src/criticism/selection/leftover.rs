@@ -65,7 +65,8 @@ impl Selector<'_> {
             if matches!(addition, Addition::Table(_, TableKind::FrictionOverTime)) && trial.gain > LEAST_TABLE_GAIN {
                 drifting.insert(joint);
             }
-            if trial.gain > LEAST_TABLE_GAIN && best.get(&joint).is_none_or(|other| trial.gain > other.gain) {
+            let least = if self.several() { LEAST_TABLE_GAIN * trial.reduction() } else { LEAST_TABLE_GAIN };
+            if trial.gain > least && best.get(&joint).is_none_or(|other| trial.gain > other.gain) {
                 best.insert(joint, trial);
             }
         }

@@ -261,7 +261,7 @@ impl Selector<'_> {
 
     /// Fits a model on until that gains nothing more: else whatever is added next gains what was left to find
     /// without it.
-    fn settle(&self, current: &mut Selection) -> Result<(), Failure> {
+    pub fn settle(&self, current: &mut Selection) -> Result<(), Failure> {
         let hypothesis = self.workshop.hypothesis(&current.additions)?;
         for component in &mut current.components {
             let windows = self.windows(&component.windows);

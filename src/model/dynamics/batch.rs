@@ -23,6 +23,8 @@ const NOISE_SCALES: [f64; 10] = [1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1e3, 3e3, 1
 pub struct BatchWindow {
     /// Which of all windows.
     pub index: usize,
+    /// Of which stream.
+    pub stream: usize,
     /// Axes by joint.
     pub axes: Vec<Axis>,
     /// Positions of the joints that rest in it.

@@ -189,7 +189,7 @@ impl WindowModel<'_> {
             return Err(Failure::NoInformation);
         }
         let mut state = self.first_state();
-        let size = 2 * n + CONTACT;
+        let size = state.len();
         let mut covariance = self.first_covariance(&state);
         let mut result = Innovations::default();
         let mut passed: Vec<Passed> = Vec::with_capacity(observations.len());
@@ -209,7 +209,7 @@ impl WindowModel<'_> {
                 own += noise.over(span, &self.all_positions(state.as_slice()), self)?;
                 advance = Some(Advance { transition, derivatives });
             }
-            let rows = state_rows(observation);
+            let rows = self.state_rows(observation);
             let innovation = &observation.value - &rows * &state;
             let spread = &covariance * rows.transpose();
             let total = &rows * &spread + DMatrix::identity(n, n);
@@ -236,7 +236,7 @@ impl WindowModel<'_> {
     /// Derivatives of the whitened innovations by the `p` parameters, row by row.
     fn innovation_slopes(&self, passed: &[Passed], p: usize, all: &mut Vec<f64>) -> Result<(), Failure> {
         let n = self.moving.len();
-        let mut slope = DMatrix::zeros(2 * n + CONTACT, p);
+        let mut slope = DMatrix::zeros(self.state_size(), p);
         all.reserve(n * p * passed.len());
         for Passed { advance, rows, gain: Gain { gain, deviation } } in passed {
             if let Some(advance) = advance {
@@ -255,7 +255,7 @@ impl WindowModel<'_> {
     /// The filter alone, step by step.
     pub(super) fn filtered(&self, x: &[f64]) -> Result<Vec<FilterStep>, Failure> {
         let n = self.moving.len();
-        let size = 2 * n + CONTACT;
+        let size = self.state_size();
         let slopes = self.slopes(x, &[])?;
         let noise = ProcessNoise::new(self, x)?;
         let mut predicted = self.first_state();
@@ -278,7 +278,7 @@ impl WindowModel<'_> {
                 let mut own = covariance.view_mut((0, 0), (2 * n, 2 * n));
                 own += noise.over(span, &self.all_positions(predicted.as_slice()), self)?;
             }
-            let rows = state_rows(observation);
+            let rows = self.state_rows(observation);
             let innovation = &observation.value - &rows * &predicted;
             let spread = &covariance * rows.transpose();
             let total = &rows * &spread + DMatrix::identity(n, n);
@@ -299,13 +299,45 @@ impl WindowModel<'_> {
 
     fn first_covariance(&self, state: &DVector<f64>) -> DMatrix<f64> {
         let n = self.moving.len();
+        let zeros = 2 * n + CONTACT;
         let deviation = |i: usize| match i {
             i if i < n => FIRST_POSITION,
             i if i < 2 * n => FIRST_RATE.hypot(FIRST_RATE_SHARE * state[i]),
-            _ => CONTACT_DEVIATION,
+            i if i < zeros => CONTACT_DEVIATION,
+            i => self.track.zero_deviations[i - zeros],
         };
-        let size = 2 * n + CONTACT;
-        DMatrix::from_fn(size, size, |i, j| if i == j { deviation(i).powi(2) } else { 0.0 })
+        let size = state.len();
+        let mut covariance = DMatrix::from_fn(size, size, |i, j| if i == j { deviation(i).powi(2) } else { 0.0 });
+        // Where the joint is follows from where it was measured.
+        for (i, deviation) in (zeros..size).map(|zero| (zero - zeros, deviation(zero))) {
+            covariance[(i, i)] += deviation.powi(2);
+            covariance[(i, zeros + i)] = -deviation.powi(2);
+            covariance[(zeros + i, i)] = -deviation.powi(2);
+        }
+        covariance
+    }
+
+    /// Of (q, q̇), the contact point's error and, where measured positions have one, theirs.
+    fn state_size(&self) -> usize {
+        let zeros = if self.track.zero_deviations.iter().any(|d| *d > 0.0) { self.moving.len() } else { 0 };
+        2 * self.moving.len() + CONTACT + zeros
+    }
+
+    /// \[H 0 G H\], what an observation sees of the state.
+    fn state_rows(&self, observation: &Observation) -> DMatrix<f64> {
+        let n = observation.rows.ncols();
+        let mut rows = DMatrix::zeros(n, self.state_size());
+        rows.columns_mut(0, n).copy_from(&observation.rows);
+        rows.columns_mut(2 * n, CONTACT).copy_from(&observation.contact_rows);
+        if rows.ncols() > 2 * n + CONTACT {
+            rows.columns_mut(2 * n + CONTACT, n).copy_from(&observation.rows);
+        }
+        rows
+    }
+
+    /// What measured positions are off by in a state.
+    pub(super) fn zeros<'s>(&self, state: &'s DVector<f64>) -> &'s [f64] {
+        &state.as_slice()[2 * self.moving.len() + CONTACT..]
     }
 
     /// Whitened innovations at `x` with gains from elsewhere.
@@ -320,7 +352,7 @@ impl WindowModel<'_> {
                 let run = self.advance(&plant, &state.as_slice()[..2 * n], span)?;
                 state.rows_mut(0, 2 * n).copy_from_slice(&run);
             }
-            let innovation = &observation.value - state_rows(observation) * &state;
+            let innovation = &observation.value - self.state_rows(observation) * &state;
             let whitened = deviation.solve_lower_triangular(&innovation).ok_or(Failure::Diverged)?;
             all.extend(whitened.iter());
             state += gain * innovation;
@@ -649,7 +681,7 @@ impl WindowModel<'_> {
         let first = &self.track.positions[0];
         let ahead = 3.min(self.track.positions.len() - 1);
         let span_s = self.track.observations[ahead].time_s - self.track.observations[0].time_s;
-        DVector::from_fn(2 * n + CONTACT, |i, _| {
+        DVector::from_fn(self.state_size(), |i, _| {
             if i < n {
                 return first[i];
             }
@@ -680,15 +712,6 @@ fn even_spans(contacts: &[Option<[f64; 2]>], span: [f64; 2]) -> [Option<[f64; 2]
         Some(cut) => [Some([span[0], cut]), Some([cut, span[1]])],
         None => [Some(span), None],
     }
-}
-
-/// [H 0 G], what an observation sees of the state.
-fn state_rows(observation: &Observation) -> DMatrix<f64> {
-    let n = observation.rows.ncols();
-    let mut rows = DMatrix::zeros(n, 2 * n + CONTACT);
-    rows.columns_mut(0, n).copy_from(&observation.rows);
-    rows.columns_mut(2 * n, CONTACT).copy_from(&observation.contact_rows);
-    rows
 }
 
 /// Standard deviations of the rates.

@@ -60,6 +60,15 @@ const GUESS_DEVIATIONS: (f64, f64, f64) = (2.5, 1.5, 0.1);
 const LOG_FORCE_DEVIATION: f64 = 1.5;
 /// Standard deviation of an end stop about where the joint was seen to halt \[m or rad\].
 pub const LIMIT_DEVIATION: f64 = 0.01;
+/// Standard deviation of the mean of a table whose constant part is a number of the joint already.
+const TABLE_MEAN_DEVIATION: f64 = 0.05;
+
+/// Covariance of entries of which the mean is next to nothing, and what they differ from it as it was.
+fn with_small_mean(covariance: &DMatrix<f64>) -> DMatrix<f64> {
+    let n = covariance.nrows();
+    let center = DMatrix::identity(n, n) - DMatrix::repeat(n, n, 1.0 / n as f64);
+    &center * covariance * &center + DMatrix::repeat(n, n, TABLE_MEAN_DEVIATION.powi(2))
+}
 
 /// Typical force and rate of a joint, and how far it goes, from the first window in which it moved.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -370,6 +379,11 @@ impl JointModel {
                 for (b, other) in table.nodes.iter().enumerate().filter(|(b, _)| *b != a) {
                     covariance[(first + a, first + b)] = (-(node - other).abs() / table.correlation).exp();
                 }
+            }
+            if table.kind == TableKind::InertiaOverPosition {
+                let n = table.nodes.len();
+                let mut own = covariance.view_mut((first, first), (n, n));
+                own.copy_from(&with_small_mean(&own.clone_owned()));
             }
         }
         Gaussian::from_moments(&mean, &covariance)

@@ -1,5 +1,7 @@
 //! The learner's windows and physics as hypotheses see them, and how one of them is taken over.
 
+use std::cmp::Reverse;
+
 use nalgebra::DMatrix;
 
 use super::batch::{BatchWindow, Hypothesis};
@@ -19,21 +21,29 @@ use crate::types::Label;
 const UNTOLD: f64 = 0.9;
 
 impl DynamicsLearner {
-    /// The windows in which joints move, in joint space; of those that move the same joints the last `most`.
-    /// Where several move, only with measured poses: hypotheses of an arm seen by clouds cost seconds a
-    /// window.
-    pub fn batch(&self, fit: &KinematicFit, input: &DynamicsInput<'_>, most: usize) -> Vec<BatchWindow> {
-        let mut batch: Vec<BatchWindow> = Vec::new();
+    /// The windows in which joints move, in joint space; of those that move the same joint, or the
+    /// same joints, `most`, the last ones of every stream. Where several move, only with measured poses:
+    /// hypotheses of an arm seen by clouds cost seconds a window.
+    pub fn batch(&self, fit: &KinematicFit, input: &DynamicsInput<'_>, most: (usize, usize)) -> Vec<BatchWindow> {
+        // How many windows of the same joints follow in the same stream, and the window.
+        let mut by_age: Vec<(usize, BatchWindow)> = Vec::new();
         for index in (0..input.windows.len().min(self.windows.len())).rev() {
             let Some(window) = self.batch_window(index, fit, input) else { continue };
             if window.moving.len() > 1 && input.windows[index].direct.is_empty() {
                 continue;
             }
+            let follows = |(_, w): &&(usize, BatchWindow)| w.moving == window.moving && w.stream == window.stream;
+            by_age.push((by_age.iter().filter(follows).count(), window));
+        }
+        by_age.sort_by_key(|(age, window)| (*age, Reverse(window.index)));
+        let mut batch: Vec<BatchWindow> = Vec::new();
+        for (_, window) in by_age {
+            let most = if window.moving.len() > 1 { most.1 } else { most.0 };
             if batch.iter().filter(|w| w.moving == window.moving).count() < most {
                 batch.push(window);
             }
         }
-        batch.reverse();
+        batch.sort_by_key(|window| window.index);
         batch
     }
 
@@ -61,6 +71,7 @@ impl DynamicsLearner {
         let involved = self.involved(fit, &moving);
         (track.observations.len() >= 3).then_some(BatchWindow {
             index,
+            stream: input.windows[index].stream,
             axes: kinematics.axes,
             frozen,
             moving,

@@ -31,10 +31,31 @@ pub struct WindowResidual {
     pub whitened: Vec<Vec<f64>>,
 }
 
+/// A residual force over a span.
+struct Piece {
+    middle_s: f64,
+    length_s: f64,
+    force: DVector<f64>,
+    /// Positions and rates.
+    state: (DVector<f64>, DVector<f64>),
+}
+
+impl Piece {
+    /// The mean of this one and the next.
+    fn join(&mut self, next: &Self) {
+        let share = next.length_s / (self.length_s + next.length_s);
+        self.middle_s += share * (next.middle_s - self.middle_s);
+        self.length_s += next.length_s;
+        self.force += (&next.force - &self.force) * share;
+        self.state.0 += (&next.state.0 - &self.state.0) * share;
+        self.state.1 += (&next.state.1 - &self.state.1) * share;
+    }
+}
+
 impl WindowModel<'_> {
     /// The residuals at `x`; positions are simulated over `horizon_s` from smoothed states, which follow each
-    /// other in half of it.
-    pub fn residual(&self, x: &[f64], horizon_s: f64) -> Result<WindowResidual, Failure> {
+    /// other in half of it, and forces are means over `span_s`, or from one observation to the next.
+    pub fn residual(&self, x: &[f64], horizon_s: f64, span_s: f64) -> Result<WindowResidual, Failure> {
         let n = self.moving.len();
         let own = self.linearize(x, &[])?;
         let whitened = (0..n).map(|i| own.whitened.iter().skip(i).step_by(n).copied().collect()).collect();
@@ -49,8 +70,7 @@ impl WindowModel<'_> {
             smoothed[k] = &steps[k].updated + gain * (&smoothed[k + 1] - &next.predicted);
         }
         let plant = self.plant(x)?;
-        let mut forces = Vec::new();
-        let mut states = Vec::new();
+        let mut pieces: Vec<Piece> = Vec::new();
         for k in 0..steps.len() - 1 {
             let span = [observations[k].time_s, observations[k + 1].time_s];
             let length = span[1] - span[0];
@@ -64,21 +84,27 @@ impl WindowModel<'_> {
             let mass = self.moving_mass(&plant, middle.rows(0, n).as_slice());
             let inertial = &mass * lacks.rows(n, n) / length;
             let force = self.force_behind(&plant, &smoothed[k], span, &lacks, &mass).unwrap_or(inertial);
-            forces.push((0.5 * (span[0] + span[1]), length, force));
-            states.push((middle.rows(0, n).into_owned(), middle.rows(n, n).into_owned()));
+            let state = (middle.rows(0, n).into_owned(), middle.rows(n, n).into_owned());
+            let piece = Piece { middle_s: 0.5 * (span[0] + span[1]), length_s: length, force, state };
+            match pieces.last_mut().filter(|last| last.length_s + 0.5 * length < span_s) {
+                Some(last) => last.join(&piece),
+                None => pieces.push(piece),
+            }
         }
         let mut squares = vec![(0.0, 0); n];
         let mut first = 0;
         while first + 1 < steps.len() {
             let start_s = observations[first].time_s;
             let mut state = smoothed[first].as_slice()[..2 * n].to_vec();
+            let zeros = self.zeros(&smoothed[first]);
             for k in first + 1..steps.len() {
                 if observations[k].time_s > start_s + horizon_s {
                     break;
                 }
                 state = self.advance(&plant, &state, [observations[k - 1].time_s, observations[k].time_s])?;
                 for (i, (sum, count)) in squares.iter_mut().enumerate() {
-                    *sum += (state[i] - self.track.positions[k][i]).powi(2);
+                    let zero = zeros.get(i).copied().unwrap_or(0.0);
+                    *sum += (state[i] + zero - self.track.positions[k][i]).powi(2);
                     *count += 1;
                 }
             }
@@ -88,6 +114,7 @@ impl WindowModel<'_> {
         if squares.iter().any(|(sum, _)| !sum.is_finite()) {
             return Err(Failure::Diverged);
         }
+        let (forces, states) = pieces.into_iter().map(|p| ((p.middle_s, p.length_s, p.force), p.state)).unzip();
         Ok(WindowResidual { forces, states, squares, whitened })
     }
 

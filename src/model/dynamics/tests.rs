@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::{DMatrix, Matrix3, Vector3};
+use nalgebra::{DMatrix, Matrix3, Matrix6, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -485,9 +485,12 @@ fn a_stuck_joint_bounds_friction_from_below() {
 
 #[test]
 fn innovations_have_their_gradient() {
-    for truth in [Truth::single(true, 0.3, 0.4, 2.5), Truth::chain()] {
+    for (truth, stream) in [(Truth::single(true, 0.3, 0.4, 2.5), 0), (Truth::chain(), 0), (Truth::chain(), 1)] {
         let mut rng = ChaCha8Rng::seed_from_u64(13);
-        let (window, contact, q) = truth.window(1.5, 0.7, 3.0, &mut rng);
+        let (mut window, contact, q) = truth.window(1.5, 0.7, 3.0, &mut rng);
+        // Angles that count from somewhere else.
+        window.stream = stream;
+        window.direct = truth.joints.iter().map(|joint| (joint.child, Matrix6::identity())).collect();
         let n = truth.joints.len();
         let moving: Vec<usize> = (0..n).collect();
         let kinematics =

@@ -12,7 +12,7 @@ use std::collections::BTreeSet;
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3, Vector6};
 
 use crate::math::{Pose, median};
-use crate::mechanism::WrenchSample;
+use crate::mechanism::{JointType, WrenchSample};
 use crate::model::window::with_shared_error;
 use crate::model::{Axis, Contact, KinematicJoint, WindowObservations};
 use crate::types::{AppliedWrench, Label, Stamp};
@@ -30,6 +30,8 @@ const CONTACT_MARGIN_S: f64 = 0.1;
 /// Standard deviation of the contact point on its part \[m\]: what the clouds' shared error leaves
 /// open; see [`crate::model::KinematicSettings`].
 pub const CONTACT_DEVIATION: f64 = 0.020;
+/// Standard deviation of where a hinge's measured angles count from, in streams after the first \[rad\].
+const ZERO_DEVIATION: f64 = 0.035;
 /// Least standard deviation of one tool position \[m\].
 const LEAST_TOOL_DEVIATION: f64 = 1e-4;
 
@@ -84,6 +86,8 @@ pub struct JointTrack {
     pub positions: Vec<DVector<f64>>,
     /// All wrenches that acted on the joints' children.
     pub drives: Vec<Drive>,
+    /// By moving joint, the standard deviation of a constant error of its measured positions \[rad\].
+    pub zero_deviations: Vec<f64>,
 }
 
 /// One wrench over a window: of a tool, at the true contact x − o and zero without contact, or of what
@@ -153,6 +157,12 @@ impl TrackSource<'_> {
         let (t0, t1) = (times[after - 1], times[after]);
         let weight = ((time_s - t0) / (t1 - t0)).clamp(0.0, 1.0);
         self.positions.iter().map(|p| p[after - 1] + weight * (p[after] - p[after - 1])).collect()
+    }
+
+    /// Encoders count from where they were switched on, which is another place with every stream.
+    fn zero_deviation(&self, joint: &KinematicJoint) -> f64 {
+        let counted = self.window.stream > 0 && self.window.direct.contains_key(&joint.child);
+        if counted && joint.joint_type == JointType::Revolute { ZERO_DEVIATION } else { 0.0 }
     }
 
     /// The contacts with the joints' children: joint, span \[s\], contact and its point, if fitted.
@@ -246,7 +256,9 @@ pub fn joint_track(source: &TrackSource<'_>, kinematics: &TrackKinematics) -> Op
             positions.push(located.position);
         }
     }
-    Some(JointTrack { observations, positions, drives })
+    let zero_deviation = |&joint: &usize| source.zero_deviation(&source.joints[joint]);
+    let zero_deviations = source.moving.iter().map(zero_deviation).collect();
+    Some(JointTrack { observations, positions, drives, zero_deviations })
 }
 
 /// Lets the force be zero outside of the contact.
