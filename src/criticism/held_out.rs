@@ -8,10 +8,10 @@ use crate::inference::Failure;
 use crate::math::median;
 use crate::model::{BatchWindow, Hypothesis};
 
-/// Parts that the windows of a component are left out in, at most; of several
-/// streams whole ones are left out, as what is the same within one may be another in the next.
+/// Parts that the windows of a component are left out in, at most.
 const FOLDS: usize = 4;
-/// From so many streams on: what is left of two says too little by itself.
+/// Of so many streams whole ones are left out, as what is the same within one may be another in the next; of two the
+/// one that is kept says too little.
 const SEVERAL: usize = 3;
 /// Linearizations of a fit to the windows that are kept: it starts where all windows have it.
 const STEPS: usize = 3;

@@ -6,8 +6,9 @@
 //! noise does to the joints, times κ ≥ 1 for what the model misses. The innovations are then white
 //! with covariance S, and −½ Σ (eᵀ S⁻¹ e + ln |S|) is the log likelihood (Ljung, "System
 //! Identification", 1999, section 7.4; Kristensen, Madsen, Jørgensen, Automatica 40, 2004).
-//! The state holds the contact point's constant error beside (q, q̇). Derivatives are for fixed gains,
-//! by forward mode for one joint and by the structure of the equations for several.
+//! The state holds the contact point's constant error beside (q, q̇), and that of angles which count from an
+//! unknown zero. Derivatives are for fixed gains, by forward mode for one joint and by the structure of the
+//! equations for several.
 
 use std::borrow::Cow;
 use std::cell::RefCell;
@@ -65,7 +66,7 @@ pub struct WindowModel<'a> {
 /// Gain and whitening of one observation.
 #[derive(Clone, Debug)]
 pub struct Gain {
-    /// K, of (q, q̇) and the contact point's error by innovation.
+    /// K, of the state by innovation.
     gain: DMatrix<f64>,
     /// L with S = L Lᵀ.
     deviation: DMatrix<f64>,
