@@ -11,6 +11,7 @@ bag() { name=$1; shift; "$venv/bin/python" "$here/generate.py" "$@" --out "$out/
 bag cabinet  cabinet --seed 10 --doors 1 --drawers 2 --panels 1
 bag chain    chain --seed 31
 bag catch    small_cabinet --seed 12 --effect catch
+bag sprung   chain --seed 607 --effect spring
 bag occluded cabinet --seed 62 --doors 1 --drawers 2 --panels 1 --occluder --mislabel 0.02 --idle 1
 
-"$venv/bin/python" "$here/check.py" "$out/cabinet" "$out/chain" "$out/catch" "$out/occluded"
+"$venv/bin/python" "$here/check.py" "$out/cabinet" "$out/chain" "$out/catch" "$out/sprung" "$out/occluded"

@@ -5,6 +5,7 @@
 //! evidence compares predictions of what was not learned yet.
 
 mod findings;
+mod foretold;
 mod held_out;
 mod numbers;
 mod rest;
@@ -13,6 +14,7 @@ mod selection;
 mod signature;
 mod statistics;
 
+pub use foretold::ForetoldWindow;
 pub use numbers::{Addition, Numbers, Workshop};
 use selection::components;
 pub use selection::{Component, Selection, Selector, Step};
@@ -27,6 +29,7 @@ use crate::mechanism::effects::TableKind;
 use crate::model::{BatchWindow, DynamicsInput, DynamicsLearner, Hypothesis, KinematicFit};
 use crate::types::Label;
 use crate::types::posterior::{Criticism, EffectPosterior, Quantity, ResidualScore, Verdict};
+use foretold::Foretold;
 use rest::RestReadings;
 use score::{Scores, scores};
 
@@ -47,6 +50,13 @@ pub struct Critic {
     #[serde(skip)]
     pub selection: Option<Selection>,
     findings: Option<Criticism>,
+    /// Windows since the last review that were foretold.
+    #[serde(default)]
+    foretold: Foretold,
+    /// Whether reviews look at windows of several joints that clouds see: from when such are not explained on, unless
+    /// nothing is found then.
+    #[serde(default)]
+    costly: bool,
     adopted: bool,
     /// The joints that the last selection's numbers are about, and the numbers.
     known: Option<(Vec<Label>, Numbers)>,
@@ -74,9 +84,34 @@ pub struct Stage {
 }
 
 impl Critic {
-    /// What was found by the last review.
+    /// What was found by the last review and by windows that were foretold.
     pub fn findings(&self) -> Criticism {
-        self.findings.clone().unwrap_or_else(Criticism::insufficient)
+        self.foretold.joined_to(self.findings.as_ref())
+    }
+
+    /// The newest window, not learned yet, as what was learned so far foretells it; `None` where it is reviewed in
+    /// any case, or where a joint moves for the first time.
+    pub fn foretell(
+        &self,
+        learner: &DynamicsLearner,
+        fit: &KinematicFit,
+        input: &DynamicsInput<'_>,
+    ) -> Option<ForetoldWindow> {
+        let least = if self.costly { 1 } else { 2 };
+        learner.declared().criticism.then(|| ForetoldWindow::of(learner, fit, input, least)).flatten()
+    }
+
+    /// The same window once it is learned. Returns whether it calls for a review of windows of several joints.
+    fn note_foretold(
+        &mut self,
+        newest: Option<ForetoldWindow>,
+        learner: &DynamicsLearner,
+        fit: &KinematicFit,
+        input: &DynamicsInput<'_>,
+    ) -> bool {
+        let is_foretold = newest.is_some();
+        self.foretold.take(newest, learner, fit, input);
+        if self.costly { !is_foretold || self.foretold.newest_misfits() } else { self.foretold.is_unexplained() }
     }
 
     /// After a review that failed: what was found before stands, but not that it was enough.
@@ -86,8 +121,8 @@ impl Critic {
         }
     }
 
-    /// Looks at all windows so far; effects that they call for are in the learner's model after it.
-    /// Returns the linearizations spent.
+    /// Looks at all windows so far, of which the newest was `foretold`; effects that they call for are in the
+    /// learner's model after it. Returns the linearizations spent.
     ///
     /// # Errors
     /// Where no hypothesis could be fitted: the findings are then as before; see [`Critic::note_failure`].
@@ -96,11 +131,17 @@ impl Critic {
         learner: &mut DynamicsLearner,
         fit: &KinematicFit,
         input: &DynamicsInput<'_>,
+        foretold: Option<ForetoldWindow>,
     ) -> Result<usize, Failure> {
         if !learner.declared().criticism {
             return Ok(0);
         }
-        let batch = learner.batch(fit, input, MOST_WINDOWS);
+        let called = self.note_foretold(foretold, learner, fit, input);
+        if self.costly && !called {
+            return Ok(0);
+        }
+        self.costly |= called;
+        let batch = learner.batch(fit, input, MOST_WINDOWS, self.costly);
         if batch.is_empty() {
             return Ok(0);
         }
@@ -220,11 +261,16 @@ impl Critic {
             *learner = with;
         }
         let steps = selected.steps;
+        let is_scored = findings.verdict != Verdict::Insufficient;
         self.known = Some((labels, seed.0));
         self.stages = seed.1;
         self.findings = Some(findings);
         self.selection = Some(selected);
         self.reviewed = reviewed;
+        if self.costly && is_scored {
+            self.foretold = Foretold::default();
+            self.costly = self.adopted;
+        }
         Ok(steps)
     }
 }
@@ -241,7 +287,7 @@ impl Critic {
         fit: &KinematicFit,
         input: &DynamicsInput<'_>,
     ) -> Result<Vec<Stage>, Failure> {
-        let batch = learner.batch(fit, input, MOST_WINDOWS);
+        let batch = learner.batch(fit, input, MOST_WINDOWS, self.costly);
         let rest = RestReadings::of(&batch, input, &SENSOR_SCALES);
         let rest_prior = rest.as_ref().and_then(RestReadings::posterior);
         let (joints, sensor) = learner.numbers()?;
@@ -364,6 +410,22 @@ fn outlying(selection: &Selection, batch: &[BatchWindow]) -> Vec<usize> {
     all
 }
 
+/// Share of the windows of joints that clouds see move together which a model has to explain with hardly more noise
+/// than the sensor's.
+const CLEAR_WINDOWS: f64 = 0.75;
+
+/// Whether clouds see joints move together, and too few of their windows are explained: what one of them lacks shows
+/// in the others, so that a name helps without being the right one.
+fn is_vague(selector: &Selector<'_>, part: &Component, scales: &BTreeMap<usize, f64>) -> bool {
+    let input = selector.workshop.input;
+    let costly = |w: &usize| {
+        let window = &selector.batch[*w];
+        window.moving.len() > 1 && input.windows[window.index].direct.is_empty()
+    };
+    let clear = part.windows.iter().filter(|w| scales.get(w).is_some_and(|scale| *scale < selection::MISFIT)).count();
+    part.windows.iter().any(costly) && (clear as f64) < CLEAR_WINDOWS * part.windows.len() as f64
+}
+
 fn joints_of(parts: impl Iterator<Item = Component>) -> Vec<usize> {
     parts.flat_map(|part| part.joints).collect()
 }
@@ -440,7 +502,8 @@ fn confirmed(
     let parts = components(batch, false);
     // What explains most windows no better than noise would says nothing of what they lack.
     let scales = noise_scales_by_place(&selected);
-    let by_noise = |part: &Component| usual_noise_scale(part, &scales) >= OUTLYING.0;
+    let by_noise =
+        |part: &Component| usual_noise_scale(part, &scales) >= OUTLYING.0 || is_vague(selector, part, &scales);
     if parts.iter().all(by_noise) {
         return Err(Failure::Diverged);
     }

@@ -2,18 +2,19 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use serde::{Deserialize, Serialize};
+
 use super::numbers::{Addition, Numbers, Workshop};
 use super::selection::{Component, Selection};
 use super::statistics::whiteness;
 use crate::inference::Failure;
 use crate::math::median;
 use crate::mechanism::JointType;
-use crate::model::{BatchWindow, Hypothesis, WindowResidual};
-use crate::types::Label;
+use crate::model::{BatchWindow, Hypothesis, KinematicJoint, WindowResidual};
 use crate::types::posterior::ResidualScore;
 
 /// Positions are simulated this far \[s\].
-const HORIZON_S: f64 = 1.0;
+pub const HORIZON_S: f64 = 1.0;
 /// Linearizations of a fit to some of the windows; κ is as all of them have it.
 const STEPS: (usize, usize) = (5, 0);
 /// Lags that whiteness is tested over.
@@ -31,7 +32,7 @@ pub struct Scores {
 }
 
 /// The force on a joint that a model leaves unexplained in a window.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct ForceLeft {
     /// The middle of the window \[s\].
     pub time_s: f64,
@@ -39,6 +40,46 @@ pub struct ForceLeft {
     pub mean: f64,
     /// Its standard deviation about that.
     pub deviation: f64,
+}
+
+/// What a model leaves of one joint in one window.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct JointScore {
+    /// The force.
+    pub force: ForceLeft,
+    /// How long it was looked at \[s\].
+    length_s: f64,
+    /// Sum of the squares of what positions are off, with their count \[m² or rad²\].
+    squares: (f64, usize),
+    /// Whitened innovations.
+    whitened: Vec<f64>,
+    /// Of the whole window, where it is known \[nats\].
+    pub log_density: Option<f64>,
+}
+
+impl JointScore {
+    /// Of one of the joints that move in a window, by its place among them.
+    pub fn of(residual: &WindowResidual, column: usize, log_density: Option<f64>) -> Self {
+        let length_s: f64 = residual.forces.iter().map(|(_, length, _)| length).sum();
+        let mean_of = |of: &dyn Fn(f64, f64) -> f64| {
+            let forces = residual.forces.iter();
+            forces.map(|(time_s, length, force)| length * of(*time_s, force[column])).sum::<f64>() / length_s.max(1e-9)
+        };
+        let mean = mean_of(&|_, force| force);
+        let deviation = mean_of(&|_, force| (force - mean).powi(2)).sqrt();
+        Self {
+            force: ForceLeft { time_s: mean_of(&|time_s, _| time_s), mean, deviation },
+            length_s,
+            squares: residual.squares[column],
+            whitened: residual.whitened[column].clone(),
+            log_density,
+        }
+    }
+
+    /// Mean square of the force \[N² or (N·m)²\].
+    pub fn force_square(&self) -> f64 {
+        self.force.mean.powi(2) + self.force.deviation.powi(2)
+    }
 }
 
 impl Scores {
@@ -74,20 +115,6 @@ struct Scored {
     residual: WindowResidual,
 }
 
-impl Scored {
-    fn force_left(&self, column: usize) -> ForceLeft {
-        let forces = &self.residual.forces;
-        let mean_of = |of: &dyn Fn(f64, f64) -> f64| {
-            let length: f64 = forces.iter().map(|(_, length, _)| length).sum();
-            forces.iter().map(|(time_s, length, force)| length * of(*time_s, force[column])).sum::<f64>()
-                / length.max(1e-9)
-        };
-        let mean = mean_of(&|_, force| force);
-        let deviation = mean_of(&|_, force| (force - mean).powi(2)).sqrt();
-        ForceLeft { time_s: mean_of(&|time_s, _| time_s), mean, deviation }
-    }
-}
-
 /// Scores a selected model on its windows; what cannot be scored of one component is no matter of the others.
 pub fn scores(workshop: &Workshop<'_>, batch: &[BatchWindow], selection: &Selection) -> Result<Scores, Failure> {
     let hypothesis = workshop.hypothesis(&selection.additions)?;
@@ -100,15 +127,15 @@ pub fn scores(workshop: &Workshop<'_>, batch: &[BatchWindow], selection: &Select
     }
     let densities = scored.iter().map(|s| (s.window, s.log_density)).collect();
     let mut scores = Scores { rows: Vec::new(), densities, left: BTreeMap::new() };
-    let mut by_joint: BTreeMap<usize, Vec<(usize, &Scored)>> = BTreeMap::new();
+    let mut by_joint: BTreeMap<usize, Vec<JointScore>> = BTreeMap::new();
     for one in &scored {
         for (column, joint) in batch[one.window].moving.iter().enumerate() {
-            by_joint.entry(*joint).or_default().push((column, one));
+            by_joint.entry(*joint).or_default().push(JointScore::of(&one.residual, column, Some(one.log_density)));
         }
     }
     for (joint, windows) in by_joint {
-        scores.rows.push(row(workshop, joint, &windows));
-        scores.left.insert(joint, windows.iter().map(|(column, one)| one.force_left(*column)).collect());
+        scores.rows.push(row(&workshop.fit.joints[joint], &windows));
+        scores.left.insert(joint, windows.iter().map(|one| one.force).collect());
     }
     scores.rows.sort_by_key(|row| row.label);
     Ok(scores)
@@ -153,31 +180,25 @@ fn sequence(
     Ok(scored)
 }
 
-fn row(workshop: &Workshop<'_>, joint: usize, windows: &[(usize, &Scored)]) -> ResidualScore {
-    let kinematic = &workshop.fit.joints[joint];
-    let revolute = kinematic.joint_type == JointType::Revolute;
-    let (mut squares, mut time) = (0.0, 0.0);
-    let (mut position_squares, mut count) = (0.0, 0);
-    for (column, one) in windows {
-        for (_, length, force) in &one.residual.forces {
-            squares += length * force[*column].powi(2);
-            time += length;
-        }
-        position_squares += one.residual.squares[*column].0;
-        count += one.residual.squares[*column].1;
-    }
-    let force = (squares / f64::max(time, 1e-9)).sqrt();
+/// A joint's scores over its windows, as published.
+pub fn row(joint: &KinematicJoint, windows: &[JointScore]) -> ResidualScore {
+    let revolute = joint.joint_type == JointType::Revolute;
+    let time: f64 = windows.iter().map(|one| one.length_s).sum();
+    let squares: f64 = windows.iter().map(|one| one.length_s * one.force_square()).sum();
+    let force = (squares / time.max(1e-9)).sqrt();
+    let (position_squares, count) =
+        windows.iter().fold((0.0, 0), |sum, one| (sum.0 + one.squares.0, sum.1 + one.squares.1));
     let position = (position_squares / count.max(1) as f64).sqrt();
-    let series: Vec<Vec<f64>> = windows.iter().map(|(column, one)| one.residual.whitened[*column].clone()).collect();
-    let density: f64 = windows.iter().map(|(_, one)| one.log_density).sum();
+    let series: Vec<Vec<f64>> = windows.iter().map(|one| one.whitened.clone()).collect();
+    let densities: Vec<f64> = windows.iter().filter_map(|one| one.log_density).collect();
     ResidualScore {
-        label: Label(kinematic.child.0),
+        label: joint.child,
         scored_windows: windows.len(),
         force_rmse_n: (!revolute).then_some(force),
         torque_rmse_nm: revolute.then_some(force),
-        position_rmse_m: if revolute { position * kinematic.radius } else { position },
+        position_rmse_m: if revolute { position * joint.radius } else { position },
         rotation_rmse_rad: if revolute { position } else { 0.0 },
-        log_predictive_density: density / windows.len().max(1) as f64,
+        log_predictive_density: densities.iter().sum::<f64>() / densities.len().max(1) as f64,
         residual_whiteness_p: whiteness(&series, LAGS),
     }
 }

@@ -156,7 +156,7 @@ impl Learner {
         let Some(fit) = &self.fit else { return scores };
         let models = self.stages(zero);
         let windows: Vec<&WindowObservations> = self.windows.iter().collect();
-        for window in self.dynamics.batch(fit, &self.input(&windows, zero), (usize::MAX, usize::MAX)) {
+        for window in self.dynamics.batch(fit, &self.input(&windows, zero), (usize::MAX, usize::MAX), true) {
             scores.add(&models, &window, self, horizon_s);
         }
         scores

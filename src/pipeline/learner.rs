@@ -460,8 +460,10 @@ impl Learner {
         let windows: Vec<&WindowObservations> = self.windows.iter().collect();
         let input =
             DynamicsInput { windows: &windows, contacts, zero: job.zero, parts: &self.hulls, use_tool: self.use_tool };
+        let foretold = self.critic.foretell(&self.dynamics, fit, &input);
         let mut inference = self.dynamics.learn_window(fit, &input);
-        match self.critic.review(&mut self.dynamics, fit, &input) {
+        let foretold = foretold.map(|window| window.learned(&inference));
+        match self.critic.review(&mut self.dynamics, fit, &input, foretold) {
             Ok(steps) => inference.steps += steps,
             Err(failure) => {
                 tracing::info!(%failure, "no physics could be fitted to all windows: they are not called adequate");

@@ -439,7 +439,7 @@ impl Record {
             let fit = self.fit(count);
             learner.learn_window(&fit, &input);
             if count == self.windows.len() {
-                critic.review(&mut learner, &fit, &input).expect("a review");
+                critic.review(&mut learner, &fit, &input, None).expect("a review");
             }
         }
         (learner, critic)

@@ -18,7 +18,7 @@ use crate::model::{BatchFit, BatchWindow};
 use trials::Trial;
 
 /// κ from which on a window is not explained.
-const MISFIT: f64 = 10.0;
+pub const MISFIT: f64 = 10.0;
 /// κ that fits start from; the base model's from both, as a wrong model has more than one optimum.
 const FIRST_SCALES: [f64; 2] = [10.0, 1e3];
 /// κ of a model that lacks nothing.

@@ -5,16 +5,18 @@ use std::cmp::Reverse;
 use nalgebra::DMatrix;
 
 use super::batch::{BatchWindow, Hypothesis};
+use super::innovations::WindowModel;
 use super::layout::{AddedEffect, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism, SENSOR_SIZE, UPPER};
 use super::learner::{
-    Block, DynamicsInput, DynamicsLearner, Site, Warm, added_effect, extended, kinematics_of, standard_sensor,
-    travel_of,
+    Block, DynamicsInput, DynamicsLearner, Site, Warm, added_effect, extended, given_kinematics, kinematics_of,
+    standard_sensor, travel_of,
 };
+use super::residual::WindowResidual;
 use super::track::{JointTrack, joint_track};
 use crate::inference::{Failure, Gaussian};
 use crate::math::median;
 use crate::mechanism::effects::EffectKind;
-use crate::model::KinematicFit;
+use crate::model::{KinematicFit, KinematicJoint};
 use crate::types::Label;
 
 /// A stop of which more than this share of the first spread is left is told of by no window.
@@ -22,14 +24,20 @@ const UNTOLD: f64 = 0.9;
 
 impl DynamicsLearner {
     /// The windows in which joints move, in joint space; of those that move the same joint, or the
-    /// same joints, `most`, the last ones of every stream. Where several move, only with measured poses:
-    /// hypotheses of an arm seen by clouds cost seconds a window.
-    pub fn batch(&self, fit: &KinematicFit, input: &DynamicsInput<'_>, most: (usize, usize)) -> Vec<BatchWindow> {
+    /// same joints, `most`, the last ones of every stream. Where several move that clouds see, only if `costly`:
+    /// hypotheses of those cost seconds a window.
+    pub fn batch(
+        &self,
+        fit: &KinematicFit,
+        input: &DynamicsInput<'_>,
+        most: (usize, usize),
+        costly: bool,
+    ) -> Vec<BatchWindow> {
         // How many windows of the same joints follow in the same stream, and the window.
         let mut by_age: Vec<(usize, BatchWindow)> = Vec::new();
         for index in (0..input.windows.len().min(self.windows.len())).rev() {
             let Some(window) = self.batch_window(index, fit, input) else { continue };
-            if window.moving.len() > 1 && input.windows[index].direct.is_empty() {
+            if !costly && window.moving.len() > 1 && input.windows[index].direct.is_empty() {
                 continue;
             }
             let follows = |(_, w): &&(usize, BatchWindow)| w.moving == window.moving && w.stream == window.stream;
@@ -58,6 +66,50 @@ impl DynamicsLearner {
         }
         learner.keep_window(input.contacts);
         learner.batch_window(last, fit, input)
+    }
+
+    /// What the numbers learned so far leave of the last window of `input`, which is not learned yet, and which
+    /// joints move in it: at least so many, seen by clouds, and none for the first time. Positions are simulated
+    /// over `horizon_s`.
+    pub fn foretold(
+        &self,
+        fit: &KinematicFit,
+        input: &DynamicsInput<'_>,
+        least_moving: usize,
+        horizon_s: f64,
+    ) -> Option<(Vec<usize>, WindowResidual)> {
+        let last = input.windows.len().checked_sub(1)?;
+        if !input.windows[last].direct.is_empty() || self.windows.len() != last {
+            return None;
+        }
+        let mut learner = self.clone();
+        learner.keep_window(input.contacts);
+        learner.follow(fit, input).ok()?;
+        let window = learner.batch_window(last, fit, input)?;
+        let learned = |w: &usize| learner.windows[*w].learned;
+        let mut known: Vec<usize> = (0..last).filter(learned).flat_map(|w| learner.moving(w, fit, input).0).collect();
+        let reached = |joint: &KinematicJoint| learner.joints.get(&joint.child).is_some_and(|m| m.reached.is_some());
+        known.extend((0..fit.joints.len()).filter(|&k| reached(&fit.joints[k])));
+        if window.moving.len() < least_moving || !window.moving.iter().all(|joint| known.contains(joint)) {
+            return None;
+        }
+        let (mean, _) = given_kinematics(&learner.belief.product(None), &learner.blocks()).ok()?.moments().ok()?;
+        let noise_scale = median((0..last).filter_map(|w| learner.noise_scale(w)).collect()).unwrap_or(1.0);
+        let model = WindowModel {
+            mechanism: &learner.mechanism,
+            axes: &window.axes,
+            frozen: &window.frozen,
+            moving: &window.moving,
+            track: &window.track,
+            noise_scale,
+        };
+        let residual = model.residual(mean.as_slice(), horizon_s, 0.0).ok()?;
+        Some((window.moving, residual))
+    }
+
+    /// κ of a window as it was last learned.
+    pub fn noise_scale(&self, window: usize) -> Option<f64> {
+        self.windows.get(window)?.noise_scale
     }
 
     fn batch_window(&self, index: usize, fit: &KinematicFit, input: &DynamicsInput<'_>) -> Option<BatchWindow> {
