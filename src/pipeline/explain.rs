@@ -19,7 +19,7 @@ use crate::model::{
 };
 use crate::registration::{
     AlignmentSettings, AxisSeed, JointFrame, JointPath, OUTLIER_COST, PartModel, Quadratic, ScanPoint, fit_circle,
-    fit_line, follow, geometric_seeds, motion_cost, outline_quadratic, pose_factor, rays_near, search_path,
+    fit_line, follow, geometric_seeds, motion_cost, outline_quadratic, pose_factor, rays_near, rest_cost, search_path,
     seen_through,
 };
 use crate::types::Label;
@@ -151,12 +151,14 @@ pub fn explain_contacts(
             |label: Label| motions.get(&label).map_or(f64::INFINITY, |m| miss_of(&contacts[index], &m.displacements));
         let own = miss(label);
         let rests = motions.get(&label).is_some_and(|m| !m.moved);
-        let other = motions
-            .iter()
-            .filter(|(other, m)| **other != label && m.moved)
-            .map(|(other, _)| (miss(*other), *other))
-            .min_by(|a, b| a.0.total_cmp(&b.0));
-        let Some((_, other)) = other.filter(|_| rests && own > 2.0 * TOOL_EXPLAINED) else { continue };
+        if !rests || own <= 2.0 * TOOL_EXPLAINED {
+            continue;
+        }
+        // One that moved, or that has left and nothing says where to.
+        let gone = |other: &Label, m: &Motion| *other != label && (m.moved || m.excess > LEFT);
+        let others = motions.iter().filter(|(other, m)| gone(other, m));
+        let other = others.map(|(other, _)| (miss(*other), *other)).min_by(|a, b| a.0.total_cmp(&b.0));
+        let Some((_, other)) = other else { continue };
         let mut relabelled = contacts.clone();
         relabelled[index].label = other;
         let moved = explain_window(&Scene { contacts: &relabelled, ..scene.bare() }, measured);
@@ -198,7 +200,7 @@ fn explain_window(scene: &Scene<'_>, measured: &BTreeMap<Label, Motion>) -> BTre
     let mut at_rest = BTreeMap::new();
     let unknown: Vec<Label> = scene.models.keys().copied().filter(|l| !motions.contains_key(l)).collect();
     for label in unknown.into_iter().filter(|&label| Some(label) != scene.root) {
-        let still = scene.evaluate(label, |_| scene.start_of(label));
+        let still = scene.rest(label);
         let rests = still.excess < EXPLAINED && scene.tool_miss(label, &still.displacements) < TOOL_EXPLAINED;
         if rests && !scene.pushed_unseen(label) {
             motions.insert(label, still);
@@ -256,7 +258,14 @@ impl<'a> Scene<'a> {
 
     /// A part as if it had stayed where it was.
     fn still(&self, label: Label) -> Motion {
-        self.still.get(&label).cloned().unwrap_or_else(|| self.evaluate(label, |_| self.start_of(label)))
+        self.still.get(&label).cloned().unwrap_or_else(|| self.rest(label))
+    }
+
+    /// The cost of rest: of what nothing touches, what comes into view of it is no sign of motion.
+    fn rest(&self, label: Label) -> Motion {
+        let touched = self.contacts.iter().any(|contact| contact.label == label);
+        let cost = if touched { motion_cost } else { rest_cost };
+        self.evaluate_by(label, |_| self.start_of(label), cost)
     }
 
     /// A part that keeps its place on another from the start on.
@@ -299,6 +308,15 @@ impl<'a> Scene<'a> {
 
     /// The cost of a given motion of a part.
     fn evaluate(&self, label: Label, displacement: impl Fn(usize) -> Pose) -> Motion {
+        self.evaluate_by(label, displacement, motion_cost)
+    }
+
+    fn evaluate_by(
+        &self,
+        label: Label,
+        displacement: impl Fn(usize) -> Pose,
+        cost_of: fn(&PartModel, &[ScanPoint], &Pose) -> f64,
+    ) -> Motion {
         let displacements: Vec<Pose> = (0..self.frames.len()).map(displacement).collect();
         let model = &self.models[&label];
         let baseline = self.baselines.get(&label).copied().unwrap_or_default();
@@ -308,7 +326,7 @@ impl<'a> Scene<'a> {
             .filter(|(k, _)| !self.scan(label, *k).is_empty())
             .map(|(k, d)| {
                 let scan = self.scan(label, k);
-                let cost = motion_cost(model, scan, d);
+                let cost = cost_of(model, scan, d);
                 // Per point, what is turned away from the sensor does not count; per scan, new faces
                 // do not. Either may happen, so the smaller excess is taken.
                 let per_point = cost - baseline.motion_cost;

@@ -6,6 +6,7 @@
 
 use nalgebra::{Matrix6, Vector3, Vector6};
 
+use super::outline::height_over_unseen;
 use super::{PartModel, ScanPoint};
 use crate::math::{Pose, from_lengths, in_lengths, length_scale};
 
@@ -13,6 +14,9 @@ use crate::math::{Pose, from_lengths, in_lengths, length_scale};
 pub const OUTLIER_COST: f64 = 4.5;
 /// Surfels are this far apart \[m\]: a point further off along the surface lies beyond a boundary.
 const BOUNDARY_SLACK: f64 = 0.012;
+
+/// Standard deviation of a face about its plane beyond what was seen of it \[m\].
+const UNSEEN_SIGMA: f64 = 0.004;
 
 /// A part's other side is at most this far behind a face \[m\].
 const THICKNESS: f64 = 0.040;
@@ -174,6 +178,20 @@ pub fn motion_cost(model: &PartModel, scan: &[ScanPoint], displacement: &Pose) -
     truncated_cost(model, scan, scan.len() / COST_POINTS, displacement, FromBehind::OtherSide)
 }
 
+/// [`motion_cost`] of a part that nothing moves: where a face may go on beyond what was seen of it before, what comes
+/// into view is no sign that the part moved.
+pub fn rest_cost(model: &PartModel, scan: &[ScanPoint], displacement: &Pose) -> f64 {
+    let reference_from_world = displacement.inverse();
+    let cost = |scan_point: &ScanPoint, y: &Vector3<f64>| {
+        let known = point_cost(model, scan_point, y, &reference_from_world, FromBehind::OtherSide);
+        let eye = scan_point.viewpoint_in_world.filter(|_| known > 1.0);
+        let view = eye.map(|eye| reference_from_world.transform_point(&eye) - y);
+        let height = view.and_then(|view| height_over_unseen(model, y, &view));
+        height.map_or(known, |height| (0.5 * (height / UNSEEN_SIGMA).powi(2)).min(known))
+    };
+    mean_cost(scan, scan.len() / COST_POINTS, &reference_from_world, cost)
+}
+
 /// Mean truncated cost per point, between 0 and `OUTLIER_COST`: for comparing far-apart poses.
 pub fn truncated_cost(
     model: &PartModel,
@@ -183,25 +201,42 @@ pub fn truncated_cost(
     from_behind: FromBehind,
 ) -> f64 {
     let reference_from_world = displacement.inverse();
-    let mut cost = 0.0;
-    let mut count = 0.0;
+    let cost =
+        |scan_point: &ScanPoint, y: &Vector3<f64>| point_cost(model, scan_point, y, &reference_from_world, from_behind);
+    mean_cost(scan, stride, &reference_from_world, cost)
+}
+
+/// The mean over every so many points, by the point and its place at the reference configuration.
+fn mean_cost(
+    scan: &[ScanPoint],
+    stride: usize,
+    reference_from_world: &Pose,
+    cost: impl Fn(&ScanPoint, &Vector3<f64>) -> f64,
+) -> f64 {
+    let (mut sum, mut count) = (0.0, 0.0);
     for scan_point in scan.iter().step_by(stride.max(1)) {
         count += 1.0;
-        let y = reference_from_world.transform_point(&scan_point.point_in_world);
-        let facing = matching_surfel(model, scan_point, &y, &reference_from_world);
-        let behind = || model.field.nearest(&y)[0].filter(|_| from_behind == FromBehind::OtherSide);
-        let Some(index) = facing.or_else(|| behind().map(|index| index as usize)) else {
-            cost += OUTLIER_COST;
-            continue;
-        };
-        let surfel = &model.surfels[index];
-        let offset = y - surfel.point;
-        let e = surfel.normal.dot(&offset);
-        let along = ((offset - surfel.normal * e).norm() - BOUNDARY_SLACK).max(0.0);
-        let height = if facing.is_some() { 0.5 * (e / surfel.sigma).powi(2) } else { back_cost(e, surfel.sigma) };
-        cost += (height + 0.5 * (along / 0.010).powi(2)).min(OUTLIER_COST);
+        sum += cost(scan_point, &reference_from_world.transform_point(&scan_point.point_in_world));
     }
-    if count > 0.0 { cost / count } else { 0.0 }
+    if count > 0.0 { sum / count } else { 0.0 }
+}
+
+fn point_cost(
+    model: &PartModel,
+    scan_point: &ScanPoint,
+    y: &Vector3<f64>,
+    reference_from_world: &Pose,
+    from_behind: FromBehind,
+) -> f64 {
+    let facing = matching_surfel(model, scan_point, y, reference_from_world);
+    let behind = || model.field.nearest(y)[0].filter(|_| from_behind == FromBehind::OtherSide);
+    let Some(index) = facing.or_else(|| behind().map(|index| index as usize)) else { return OUTLIER_COST };
+    let surfel = &model.surfels[index];
+    let offset = y - surfel.point;
+    let e = surfel.normal.dot(&offset);
+    let along = ((offset - surfel.normal * e).norm() - BOUNDARY_SLACK).max(0.0);
+    let height = if facing.is_some() { 0.5 * (e / surfel.sigma).powi(2) } else { back_cost(e, surfel.sigma) };
+    (height + 0.5 * (along / 0.010).powi(2)).min(OUTLIER_COST)
 }
 
 /// Cost of a point seen from behind a face at a height over it \[m\]: on the part's other side, which was

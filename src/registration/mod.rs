@@ -18,8 +18,8 @@ pub use align::{Alignment, align, follow};
 pub use articulated::{JointFrame, JointPath, search_path};
 pub use faces::{Face, Suggestion, suggested_direction};
 pub use factor::{
-    AlignmentSettings, FromBehind, OUTLIER_COST, PoseFactor, Quadratic, motion_cost, pose_factor, thinned_cost,
-    truncated_cost,
+    AlignmentSettings, FromBehind, OUTLIER_COST, PoseFactor, Quadratic, motion_cost, pose_factor, rest_cost,
+    thinned_cost, truncated_cost,
 };
 pub use field::NearestField;
 pub use outline::{Outline, outline_quadratic, rays_near, seen_through};

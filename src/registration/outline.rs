@@ -16,6 +16,9 @@ use crate::math::Pose;
 const EDGE_SIGMA: f64 = 0.006;
 /// Share of rays near an edge with a wrong label.
 const WRONG_SHARE: f64 = 0.05;
+/// Labels are wrong up to this far from a silhouette \[m\], so that so many passes are needed farther off.
+const BLEED: f64 = 0.010;
+const FEWEST_CLEAR_RAYS: usize = 6;
 /// Rays further than this from an edge say nothing of it \[m\].
 const EDGE_REACH: f64 = 0.030;
 /// A hit lies this close to the face's plane \[m\].
@@ -134,10 +137,25 @@ impl Outline {
             }
             let cost = |shift: f64| near.iter().map(|(s, hit)| edge_terms(s - shift, *hit).0).sum::<f64>();
             let shift = (-15..=15).map(|i| f64::from(i) * 0.001).min_by(|a, b| cost(*a).total_cmp(&cost(*b)))?;
+            // Where another part stands in front nothing is seen beyond but its wrong labels.
+            let clear = near.iter().filter(|(s, hit)| !hit && s - shift > BLEED).count();
+            if clear < FEWEST_CLEAR_RAYS {
+                return None;
+            }
             let wrong = near.iter().filter(|(s, hit)| *hit != (*s < shift) && (s - shift).abs() > EDGE_SIGMA).count();
             ((wrong as f64) < MOST_WRONG * near.len() as f64).then_some(Edge { offset: edge.offset + shift, ..*edge })
         };
         self.edges = edges.iter().filter_map(set).collect();
+    }
+
+    /// How far a place is from the plane \[m\], where the face may go on there: past no edge that is trusted, and
+    /// no farther than what was seen of it is long.
+    fn height_where_it_goes_on(&self, place: &Vector3<f64>) -> Option<f64> {
+        let from = place - self.center;
+        let height = self.normal.dot(&from).abs();
+        let past = |edge: &Edge| edge.outward.dot(place) > edge.offset + EDGE_SIGMA;
+        let near = (0..2).all(|i| self.axes[i].dot(&from).abs() < 3.0 * self.half[i]);
+        (height < HIT_HEIGHT && near && !self.edges.iter().any(past)).then_some(height)
     }
 
     /// Whether a place is beside an edge, not round a corner of the face.
@@ -199,6 +217,13 @@ impl Outline {
             }
         }
     }
+}
+
+/// The least distance of a place from the plane of a face that is seen along `view`, towards the sensor, and may go
+/// on there \[m\].
+pub fn height_over_unseen(model: &PartModel, place: &Vector3<f64>, view: &Vector3<f64>) -> Option<f64> {
+    let facing = model.outlines.iter().filter(|outline| outline.normal.dot(view) > 0.0);
+    facing.filter_map(|outline| outline.height_where_it_goes_on(place)).min_by(f64::total_cmp)
 }
 
 /// The share of rays that end behind a face where it has surface, of all that meet it there: what is
@@ -286,7 +311,7 @@ fn error_function(x: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::registration::SurfelAccumulator;
+    use crate::registration::{SurfelAccumulator, motion_cost, rest_cost};
 
     /// A board of 30 cm × 20 cm, 40 cm in front of a wall, as a sensor at the origin sees them.
     fn rays(shift: f64) -> (Vec<ScanPoint>, Vec<ScanPoint>) {
@@ -335,6 +360,37 @@ mod tests {
         assert!(seen_through(&model, &own, (&others, 1), &Pose::identity()) > 0.9);
         let there = Pose::from_translation(Vector3::new(0.40, 0.0, 0.0));
         assert!(seen_through(&model, &own, (&others, 1), &there) < 0.05);
+    }
+
+    /// The left half of the board, the right one behind another part, of which `bleed` metres beside the gap look like
+    /// parts of it in the board's plane; and the whole board.
+    fn half_hidden(bleed: f64) -> (PartModel, Vec<ScanPoint>) {
+        let (board, wall) = rays(0.0);
+        let own: Vec<ScanPoint> = board.iter().filter(|p| p.point_in_world.x < 0.0).copied().collect();
+        let wrong = board.iter().filter(|p| (0.0..bleed).contains(&p.point_in_world.x)).copied();
+        let others = wall.into_iter().chain(wrong).collect();
+        let mut accumulator = SurfelAccumulator::default();
+        accumulator.add(&own, &Pose::identity());
+        let mut model = PartModel::new(&accumulator.surfels()).expect("enough surfels");
+        model.calibrate_outlines(&[(&own, others)]);
+        (model, board)
+    }
+
+    #[test]
+    fn what_stands_in_front_makes_no_edge() {
+        let rightwards = |model: &PartModel| model.outlines[0].edges.iter().any(|edge| edge.outward.x > 0.9);
+        assert!(!rightwards(&half_hidden(0.004).0));
+        // A part beside it in the same plane does.
+        assert!(rightwards(&half_hidden(0.030).0));
+    }
+
+    #[test]
+    fn what_comes_into_view_beyond_a_hidden_edge_is_no_motion() {
+        let (model, board) = half_hidden(0.004);
+        assert!(motion_cost(&model, &board, &Pose::identity()) > 1.5);
+        assert!(rest_cost(&model, &board, &Pose::identity()) < 0.5);
+        let (model, board) = half_hidden(0.030);
+        assert!(rest_cost(&model, &board, &Pose::identity()) > 1.5);
     }
 
     #[test]
