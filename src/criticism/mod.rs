@@ -333,7 +333,9 @@ const MUCH: (f64, f64) = (30.0, 0.3);
 /// Whether a joint's residual force is large, and explained by process noise alone.
 fn leaves_much(workshop: &Workshop<'_>, selection: &Selection, scores: &Scores) -> bool {
     (0..workshop.fit.joints.len()).any(|joint| {
-        let noise = crate::math::median(selection.noise_scales_of(Some(joint)));
+        let scales = selection.noise_scales_of(Some(joint));
+        let is_usual = scales.iter().filter(|scale| **scale >= MUCH.0).count() >= NO_ACCIDENT;
+        let noise = crate::math::median(scales).filter(|_| is_usual);
         noise.is_some_and(|scale| scale >= MUCH.0) && leaves(workshop, scores, joint, MUCH.1)
     })
 }
