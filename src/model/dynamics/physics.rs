@@ -84,15 +84,19 @@ impl DynamicsLearner {
         }
         let mut learner = self.clone();
         learner.keep_window(input.contacts);
+        let (moving, _) = learner.moving(last, fit, input);
+        if moving.len() < least_moving {
+            return None;
+        }
         learner.follow(fit, input).ok()?;
-        let window = learner.batch_window(last, fit, input)?;
         let learned = |w: &usize| learner.windows[*w].learned;
         let mut known: Vec<usize> = (0..last).filter(learned).flat_map(|w| learner.moving(w, fit, input).0).collect();
         let reached = |joint: &KinematicJoint| learner.joints.get(&joint.child).is_some_and(|m| m.reached.is_some());
         known.extend((0..fit.joints.len()).filter(|&k| reached(&fit.joints[k])));
-        if window.moving.len() < least_moving || !window.moving.iter().all(|joint| known.contains(joint)) {
+        if !moving.iter().all(|joint| known.contains(joint)) {
             return None;
         }
+        let window = learner.batch_window(last, fit, input)?;
         let (mean, _) = given_kinematics(&learner.belief.product(None), &learner.blocks()).ok()?.moments().ok()?;
         let noise_scale = median((0..last).filter_map(|w| learner.noise_scale(w)).collect()).unwrap_or(1.0);
         let model = WindowModel {
