@@ -45,7 +45,7 @@ fn springs_of_joints_that_move_together_are_found() {
         let effect = found.effects.iter().find(|e| e.label.is_some_and(|l| u64::from(l.0) == label)).unwrap();
         assert_eq!(effect.name, "spring", "{:?}", found.effects);
         let (stiffness, true_stiffness) = (&effect.parameters["stiffness"], spring["stiffness"].as_f64().unwrap());
-        // A lever of .3 kg is found a fifth too stiff, as such come out too heavy to turn.
+        // A lever of .2 kg is found a fifth too stiff, as such come out too heavy to turn.
         assert!((stiffness.median / true_stiffness - 1.0).abs() < 0.25, "{stiffness:?}, not {true_stiffness}");
         labels.push(label);
     }

@@ -1,5 +1,5 @@
-//! Windows in which several joints move that clouds see. Hypotheses of those cost seconds a window, so none is
-//! fitted: what was learned before foretells them, and what that leaves says whether something is missing.
+//! Windows in which several joints move that clouds see. Hypotheses of those cost seconds a window, so what was
+//! learned before foretells them, and only where that leaves too much are they reviewed.
 
 use std::collections::BTreeMap;
 
@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::score::{HORIZON_S, JointScore, row};
 use super::selection::MISFIT;
-use super::{MOST_WINDOWS, MUCH, NO_ACCIDENT, SOME, findings};
+use super::{MOST_WINDOWS, NO_ACCIDENT, SOME, findings, several_by_noise};
 use crate::math::median;
 use crate::mechanism::JointType;
 use crate::model::{DynamicsInput, DynamicsLearner, KinematicFit, WindowInference};
@@ -114,12 +114,8 @@ impl Foretold {
 
     /// The findings of a review together with what these windows say of the joints that it did not look at.
     pub fn joined_to(&self, reviewed: Option<&Criticism>) -> Criticism {
-        let (own, mut all) = match (&self.findings, reviewed) {
-            (None, None) => return Criticism::insufficient(),
-            (None, Some(reviewed)) => return reviewed.clone(),
-            (Some(own), None) => return own.clone(),
-            (Some(own), Some(reviewed)) => (own, reviewed.clone()),
-        };
+        let mut all = reviewed.cloned().unwrap_or_else(Criticism::insufficient);
+        let Some(own) = &self.findings else { return all };
         let new: Vec<_> =
             own.before.iter().filter(|row| all.before.iter().all(|other| other.label != row.label)).cloned().collect();
         all.before.extend(new.iter().cloned());
@@ -149,9 +145,8 @@ impl Foretold {
             let usual = median(scores.iter().map(|s| s.usual).collect()).unwrap_or(f64::INFINITY);
             let force = median(scores.iter().map(|s| s.left.force_square().sqrt()).collect()).unwrap_or(0.0);
             tracing::debug!(label = %joint.child, force, usual, ?scales, "foretold");
-            let by_noise = scales.iter().filter(|scale| **scale >= MUCH.0).count();
-            let is_felt = force >= if by_noise >= NO_ACCIDENT { SOME } else { 1.0 } * usual;
-            if scales.len() >= NO_ACCIDENT && is_felt {
+            let share = if several_by_noise(scales.iter().copied()) { SOME } else { 1.0 };
+            if scales.len() >= NO_ACCIDENT && force >= share * usual {
                 missing.push(k);
             }
             by_joint.insert(k, scores.into_iter().map(|s| s.left.clone()).collect());
@@ -163,11 +158,11 @@ impl Foretold {
             return findings;
         }
         findings.verdict = if missing.is_empty() { Verdict::Adequate } else { Verdict::Unexplained };
-        findings.effects = missing.iter().map(|k| findings::unknown(&fit.joints[*k], &forces(&by_joint[k]))).collect();
+        let unknown = |k: &usize| {
+            let left: Vec<_> = by_joint[k].iter().map(|score| score.force).collect();
+            findings::unknown(&fit.joints[*k], &left)
+        };
+        findings.effects = missing.iter().map(unknown).collect();
         findings
     }
-}
-
-fn forces(scores: &[JointScore]) -> Vec<super::score::ForceLeft> {
-    scores.iter().map(|score| score.force).collect()
 }

@@ -334,9 +334,8 @@ const MUCH: (f64, f64) = (30.0, 0.3);
 fn leaves_much(workshop: &Workshop<'_>, selection: &Selection, scores: &Scores) -> bool {
     (0..workshop.fit.joints.len()).any(|joint| {
         let scales = selection.noise_scales_of(Some(joint));
-        let is_usual = scales.iter().filter(|scale| **scale >= MUCH.0).count() >= NO_ACCIDENT;
-        let noise = crate::math::median(scales).filter(|_| is_usual);
-        noise.is_some_and(|scale| scale >= MUCH.0) && leaves(workshop, scores, joint, MUCH.1)
+        let is_usual = crate::math::median(scales.clone()).is_some_and(|scale| scale >= MUCH.0);
+        is_usual && several_by_noise(scales.into_iter()) && leaves(workshop, scores, joint, MUCH.1)
     })
 }
 
@@ -352,6 +351,11 @@ const NO_ACCIDENT: usize = 2;
 /// And the share of the joint's usual force that is left.
 const SOME: f64 = 0.05;
 
+/// Whether noise alone explains several windows, by their κ.
+fn several_by_noise(scales: impl Iterator<Item = f64>) -> bool {
+    scales.filter(|scale| *scale >= MUCH.0).count() >= NO_ACCIDENT
+}
+
 /// Joints of which several windows are explained by process noise alone, or that are `drifting`: what acts on
 /// those has no name here.
 fn unknown_joints(
@@ -363,8 +367,8 @@ fn unknown_joints(
 ) -> Vec<usize> {
     let scales = noise_scales_by_place(selection);
     let by_noise = |joint: &usize| {
-        let windows = scales.iter().filter(|(w, scale)| **scale >= MUCH.0 && batch[**w].moving.contains(joint));
-        windows.count() >= NO_ACCIDENT
+        let own = scales.iter().filter(|(w, _)| batch[**w].moving.contains(joint));
+        several_by_noise(own.map(|(_, scale)| *scale))
     };
     let is_felt = |joint: &usize| leaves(workshop, scores, *joint, SOME);
     (0..workshop.fit.joints.len())
@@ -420,10 +424,7 @@ const CLEAR_WINDOWS: f64 = 0.75;
 /// in the others, so that a name helps without being the right one.
 fn is_vague(selector: &Selector<'_>, part: &Component, scales: &BTreeMap<usize, f64>) -> bool {
     let input = selector.workshop.input;
-    let costly = |w: &usize| {
-        let window = &selector.batch[*w];
-        window.moving.len() > 1 && input.windows[window.index].direct.is_empty()
-    };
+    let costly = |w: &usize| selector.batch[*w].is_costly(input);
     let clear = part.windows.iter().filter(|w| scales.get(w).is_some_and(|scale| *scale < selection::MISFIT)).count();
     part.windows.iter().any(costly) && (clear as f64) < CLEAR_WINDOWS * part.windows.len() as f64
 }

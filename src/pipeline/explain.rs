@@ -263,8 +263,7 @@ impl<'a> Scene<'a> {
 
     /// The cost of rest: of what nothing touches, what comes into view of it is no sign of motion.
     fn rest(&self, label: Label) -> Motion {
-        let touched = self.contacts.iter().any(|contact| contact.label == label);
-        let cost = if touched { motion_cost } else { rest_cost };
+        let cost = if self.is_touched(label) { motion_cost } else { rest_cost };
         self.evaluate_by(label, |_| self.start_of(label), cost)
     }
 
@@ -300,6 +299,10 @@ impl<'a> Scene<'a> {
 
     fn scan(&self, label: Label, frame: usize) -> &[ScanPoint] {
         self.frames[frame].scans.get(&label).map_or(&[], |scan| if scan.len() < FEWEST_POINTS { &[] } else { scan })
+    }
+
+    fn is_touched(&self, label: Label) -> bool {
+        self.contacts.iter().any(|contact| contact.label == label)
     }
 
     fn contact(&self, label: Label) -> Option<&Contact> {
@@ -364,7 +367,7 @@ impl<'a> Scene<'a> {
     /// same wherever its joint has it, so rest is no better an account of it than its joint.
     fn pushed_unseen(&self, label: Label) -> bool {
         let known = self.touched_before.contains(&label) && self.joints.iter().any(|joint| joint.child == label);
-        known && !self.use_tool && self.contacts.iter().any(|contact| contact.label == label)
+        known && !self.use_tool && self.is_touched(label)
     }
 
     /// Root mean square by which the tool misses a contact point that is fixed on the part \[m\].
@@ -390,7 +393,7 @@ impl<'a> Scene<'a> {
     /// is a new face coming into view, not motion.
     fn beats(&self, label: Label, motion: &Motion, still: &Motion) -> bool {
         let gain = still.excess - motion.excess;
-        let share = if self.contacts.iter().any(|c| c.label == label) { 0.3 } else { 0.5 };
+        let share = if self.is_touched(label) { 0.3 } else { 0.5 };
         let by_its_joint = motion.seed.is_none() && self.pushed_unseen(label);
         let seen = gain > if by_its_joint { RECONSIDERED } else { EXPLAINED } && gain > share * still.excess;
         let miss = self.tool_miss(label, &still.displacements);
@@ -517,8 +520,8 @@ impl<'a> Scene<'a> {
         let carried = simple.as_ref().map_or(still.excess, |m| m.excess.min(still.excess));
         // A part that nothing touches needs a better reason for a joint of its own: what it shows anew
         // must not pass for motion.
-        let touched = self.contacts.iter().any(|c| c.label == label);
-        let reluctance = 0.02 + if touched { 0.0 } else { 0.1 + (0.4 * carried.max(0.0)).min(MOST_RELUCTANCE) };
+        let reluctance =
+            0.02 + if self.is_touched(label) { 0.0 } else { 0.1 + (0.4 * carried.max(0.0)).min(MOST_RELUCTANCE) };
         let mut best = Best { motion: simple };
         for parent in self.possible_parents(label, known) {
             for motion in offers.refined.get(&(label, parent)).into_iter().flatten() {

@@ -15,6 +15,8 @@ pub const OUTLIER_COST: f64 = 4.5;
 /// Surfels are this far apart \[m\]: a point further off along the surface lies beyond a boundary.
 const BOUNDARY_SLACK: f64 = 0.012;
 
+/// Of a point that costs more no known surface is an account.
+const UNMATCHED_COST: f64 = 1.0;
 /// Standard deviation of a face about its plane beyond what was seen of it \[m\].
 const UNSEEN_SIGMA: f64 = 0.004;
 
@@ -184,7 +186,7 @@ pub fn rest_cost(model: &PartModel, scan: &[ScanPoint], displacement: &Pose) -> 
     let reference_from_world = displacement.inverse();
     let cost = |scan_point: &ScanPoint, y: &Vector3<f64>| {
         let known = point_cost(model, scan_point, y, &reference_from_world, FromBehind::OtherSide);
-        let eye = scan_point.viewpoint_in_world.filter(|_| known > 1.0);
+        let eye = scan_point.viewpoint_in_world.filter(|_| known > UNMATCHED_COST);
         let view = eye.map(|eye| reference_from_world.transform_point(&eye) - y);
         let height = view.and_then(|view| height_over_unseen(model, y, &view));
         height.map_or(known, |height| (0.5 * (height / UNSEEN_SIGMA).powi(2)).min(known))

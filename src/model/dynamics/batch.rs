@@ -10,6 +10,7 @@ use rayon::prelude::*;
 
 use super::innovations::{Gain, Innovations, WindowModel, normal_equations};
 use super::layout::Mechanism;
+use super::learner::DynamicsInput;
 use super::site::{inertial_entries, log_density, reduction, scale_cost};
 use super::track::JointTrack;
 use crate::inference::{Failure, Gaussian, LeastSquares, Linearization, SolverSettings, solve};
@@ -35,6 +36,25 @@ pub struct BatchWindow {
     pub involved: Vec<(usize, bool)>,
     /// Observations and wrench.
     pub track: JointTrack,
+}
+
+impl BatchWindow {
+    /// The window under a mechanism at a process noise.
+    pub fn model<'a>(&'a self, mechanism: &'a Mechanism, noise_scale: f64) -> WindowModel<'a> {
+        WindowModel {
+            mechanism,
+            axes: &self.axes,
+            frozen: &self.frozen,
+            moving: &self.moving,
+            track: &self.track,
+            noise_scale,
+        }
+    }
+
+    /// Whether several joints move that clouds see: a hypothesis of such a window costs seconds.
+    pub fn is_costly(&self, input: &DynamicsInput<'_>) -> bool {
+        self.moving.len() > 1 && input.windows[self.index].direct.is_empty()
+    }
 }
 
 /// A model of the physics with its prior over all of its numbers.
@@ -97,14 +117,7 @@ impl Hypothesis {
 
     /// The model of one window.
     pub fn window<'a>(&'a self, window: &'a BatchWindow, noise_scale: f64) -> WindowModel<'a> {
-        WindowModel {
-            mechanism: &self.mechanism,
-            axes: &window.axes,
-            frozen: &window.frozen,
-            moving: &window.moving,
-            track: &window.track,
-            noise_scale,
-        }
+        window.model(&self.mechanism, noise_scale)
     }
 
     /// Fits all windows from `x`, with κ by window to start from; `rounds` times κ is chosen anew.

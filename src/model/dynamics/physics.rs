@@ -5,11 +5,10 @@ use std::cmp::Reverse;
 use nalgebra::DMatrix;
 
 use super::batch::{BatchWindow, Hypothesis};
-use super::innovations::WindowModel;
 use super::layout::{AddedEffect, JointModel, JointScales, LIMIT_DEVIATION, LOWER, Mechanism, SENSOR_SIZE, UPPER};
 use super::learner::{
-    Block, DynamicsInput, DynamicsLearner, Site, Warm, added_effect, extended, given_kinematics, kinematics_of,
-    standard_sensor, travel_of,
+    Block, DynamicsInput, DynamicsLearner, Site, Warm, WindowMemory, added_effect, extended, given_kinematics,
+    kinematics_of, standard_sensor, travel_of,
 };
 use super::residual::WindowResidual;
 use super::track::{JointTrack, joint_track};
@@ -24,8 +23,7 @@ const UNTOLD: f64 = 0.9;
 
 impl DynamicsLearner {
     /// The windows in which joints move, in joint space; of those that move the same joint, or the
-    /// same joints, `most`, the last ones of every stream. Where several move that clouds see, only if `costly`:
-    /// hypotheses of those cost seconds a window.
+    /// same joints, `most`, the last ones of every stream; costly ones only if asked for.
     pub fn batch(
         &self,
         fit: &KinematicFit,
@@ -37,7 +35,7 @@ impl DynamicsLearner {
         let mut by_age: Vec<(usize, BatchWindow)> = Vec::new();
         for index in (0..input.windows.len().min(self.windows.len())).rev() {
             let Some(window) = self.batch_window(index, fit, input) else { continue };
-            if !costly && window.moving.len() > 1 && input.windows[index].direct.is_empty() {
+            if !costly && window.is_costly(input) {
                 continue;
             }
             let follows = |(_, w): &&(usize, BatchWindow)| w.moving == window.moving && w.stream == window.stream;
@@ -59,13 +57,16 @@ impl DynamicsLearner {
     /// moves in it.
     pub fn unlearned_window(&self, fit: &KinematicFit, input: &DynamicsInput<'_>) -> Option<BatchWindow> {
         let last = input.windows.len().checked_sub(1)?;
+        self.with_unlearned(last, input).batch_window(last, fit, input)
+    }
+
+    /// The same with the last window of `input` kept and not learned.
+    fn with_unlearned(&self, last: usize, input: &DynamicsInput<'_>) -> Self {
         let mut learner = self.clone();
         learner.windows.truncate(last);
-        while learner.windows.len() < last {
-            learner.keep_window(&[]);
-        }
+        learner.windows.resize_with(last, WindowMemory::default);
         learner.keep_window(input.contacts);
-        learner.batch_window(last, fit, input)
+        learner
     }
 
     /// What the numbers learned so far leave of the last window of `input`, which is not learned yet, and which
@@ -79,11 +80,10 @@ impl DynamicsLearner {
         horizon_s: f64,
     ) -> Option<(Vec<usize>, WindowResidual)> {
         let last = input.windows.len().checked_sub(1)?;
-        if !input.windows[last].direct.is_empty() || self.windows.len() != last {
+        if !input.windows[last].direct.is_empty() {
             return None;
         }
-        let mut learner = self.clone();
-        learner.keep_window(input.contacts);
+        let mut learner = self.with_unlearned(last, input);
         let (moving, _) = learner.moving(last, fit, input);
         if moving.len() < least_moving {
             return None;
@@ -99,14 +99,7 @@ impl DynamicsLearner {
         let window = learner.batch_window(last, fit, input)?;
         let (mean, _) = given_kinematics(&learner.belief.product(None), &learner.blocks()).ok()?.moments().ok()?;
         let noise_scale = median((0..last).filter_map(|w| learner.noise_scale(w)).collect()).unwrap_or(1.0);
-        let model = WindowModel {
-            mechanism: &learner.mechanism,
-            axes: &window.axes,
-            frozen: &window.frozen,
-            moving: &window.moving,
-            track: &window.track,
-            noise_scale,
-        };
+        let model = window.model(&learner.mechanism, noise_scale);
         let residual = model.residual(mean.as_slice(), horizon_s, 0.0).ok()?;
         Some((window.moving, residual))
     }
