@@ -16,6 +16,7 @@ use std::cell::RefCell;
 use nalgebra::{DMatrix, DVector, Vector3};
 use num_dual::DualSVec64;
 
+use super::attenuation::{SensedNoise, SharedNoise};
 use super::layout::{AddedTable, Mechanism, SensorError};
 use super::track::{CONTACT_DEVIATION, Drive, JointTrack, Observation};
 use crate::inference::Failure;
@@ -67,9 +68,9 @@ pub struct WindowModel<'a> {
 #[derive(Clone, Debug)]
 pub struct Gain {
     /// K, of the state by innovation.
-    gain: DMatrix<f64>,
+    pub(super) gain: DMatrix<f64>,
     /// L with S = L Lᵀ.
-    deviation: DMatrix<f64>,
+    pub(super) deviation: DMatrix<f64>,
 }
 
 /// One observation of the filter: before it and after it.
@@ -83,11 +84,13 @@ pub(super) struct FilterStep {
 }
 
 /// The way from one observation to the next.
-struct Advance {
+pub(super) struct Advance {
     /// Of the whole state.
-    transition: DMatrix<f64>,
+    pub(super) transition: DMatrix<f64>,
     /// Of (q, q̇) by the parameters, and by (q, q̇) before.
     derivatives: DMatrix<f64>,
+    /// The tool's readings' noise in between.
+    pub(super) sensed: SensedNoise,
 }
 
 /// A span under way, chunk by chunk.
@@ -100,10 +103,10 @@ struct Passage {
 }
 
 /// One observation, and the way to it.
-struct Passed {
-    advance: Option<Advance>,
-    rows: DMatrix<f64>,
-    gain: Gain,
+pub(super) struct Passed {
+    pub(super) advance: Option<Advance>,
+    pub(super) rows: DMatrix<f64>,
+    pub(super) gain: Gain,
 }
 
 /// Innovations of a window.
@@ -181,6 +184,20 @@ struct Chain {
 impl WindowModel<'_> {
     /// Innovations, their derivatives by the `active` entries of `x`, and the gains, at `x`.
     pub fn linearize(&self, x: &[f64], active: &[usize]) -> Result<Innovations, Failure> {
+        self.pass_all(x, active).map(|(innovations, _)| innovations)
+    }
+
+    /// The same, and what innovations and derivatives have in common of the readings' noise.
+    pub(super) fn linearize_with_noise(
+        &self,
+        x: &[f64],
+        active: &[usize],
+    ) -> Result<(Innovations, SharedNoise), Failure> {
+        let (innovations, passed) = self.pass_all(x, active)?;
+        Ok((innovations, SharedNoise::of(&passed, self, (x, active))?))
+    }
+
+    fn pass_all(&self, x: &[f64], active: &[usize]) -> Result<(Innovations, Vec<Passed>), Failure> {
         let n = self.moving.len();
         let p = active.len();
         let slopes = self.slopes(x, active)?;
@@ -207,8 +224,12 @@ impl WindowModel<'_> {
                 let carried = self.over_spread(&slopes, &transition, ends, &covariance, span)?;
                 covariance = &*carried * covariance * carried.transpose();
                 let mut own = covariance.view_mut((0, 0), (2 * n, 2 * n));
-                own += noise.over(span, &self.all_positions(state.as_slice()), self)?;
-                advance = Some(Advance { transition, derivatives });
+                let positions = self.all_positions(state.as_slice());
+                let (added, density) = noise.over(span, &positions, self)?;
+                own += &added;
+                let free = (0..n).filter(|&i| next[n + i] != 0.0).collect();
+                let sensed = SensedNoise { positions, density, span_s: span[1] - span[0], free };
+                advance = Some(Advance { transition, derivatives, sensed });
             }
             let rows = self.state_rows(observation);
             let innovation = &observation.value - &rows * &state;
@@ -226,9 +247,9 @@ impl WindowModel<'_> {
             passed.push(Passed { advance, rows, gain: Gain { gain, deviation } });
         }
         self.innovation_slopes(&passed, p, &mut result.slopes)?;
-        result.gains = passed.into_iter().map(|passed| passed.gain).collect();
+        result.gains = passed.iter().map(|passed| passed.gain.clone()).collect();
         if result.whitened.iter().chain(&result.slopes).all(|e| e.is_finite()) {
-            Ok(result)
+            Ok((result, passed))
         } else {
             Err(Failure::Diverged)
         }
@@ -277,7 +298,7 @@ impl WindowModel<'_> {
                 transition = carried.into_owned();
                 covariance = &transition * &last.updated_covariance * transition.transpose();
                 let mut own = covariance.view_mut((0, 0), (2 * n, 2 * n));
-                own += noise.over(span, &self.all_positions(predicted.as_slice()), self)?;
+                own += noise.over(span, &self.all_positions(predicted.as_slice()), self)?.0;
             }
             let rows = self.state_rows(observation);
             let innovation = &observation.value - &rows * &predicted;
@@ -735,6 +756,13 @@ struct ProcessNoise {
     floor: Vec<f64>,
 }
 
+/// Covariance that (q, q̇) gather over a span by white noise of their accelerations.
+pub(super) fn gathered(density: &DMatrix<f64>, span_s: f64) -> DMatrix<f64> {
+    let (n, h) = (density.nrows(), span_s);
+    let share = [[h * h * h / 3.0, h * h / 2.0], [h * h / 2.0, h]];
+    DMatrix::from_fn(2 * n, 2 * n, |i, j| share[i / n][j / n] * density[(i % n, j % n)])
+}
+
 impl ProcessNoise {
     fn new(model: &WindowModel<'_>, x: &[f64]) -> Result<Self, Failure> {
         let tree = model.mechanism.tree(x, model.axes, model.frozen)?;
@@ -750,10 +778,15 @@ impl ProcessNoise {
         Ok(Self { tree, workspace, floor })
     }
 
-    /// Covariance that (q, q̇) gather over a span.
-    fn over(&self, span: [f64; 2], q: &[f64], model: &WindowModel<'_>) -> Result<DMatrix<f64>, Failure> {
+    /// Covariance that (q, q̇) gather over a span, and the density of what the tool's readings do of it without κ.
+    fn over(
+        &self,
+        span: [f64; 2],
+        q: &[f64],
+        model: &WindowModel<'_>,
+    ) -> Result<(DMatrix<f64>, DMatrix<f64>), Failure> {
         let n = model.moving.len();
-        let mut density = DMatrix::from_fn(n, n, |i, j| if i == j { self.floor[i] } else { 0.0 });
+        let (mut sensed, mut others) = (DMatrix::zeros(n, n), DMatrix::zeros(n, n));
         let (screws, mass) = self.tree.screws_and_mass_matrix(q, &mut self.workspace.borrow_mut());
         for drive in &model.track.drives {
             let Some(sample) = within(&drive.samples, span).first() else { continue };
@@ -766,21 +799,21 @@ impl ProcessNoise {
                 }
                 at = model.mechanism.joints[joint].joint.parent;
             }
+            let acting = if drive.tool { &mut sensed } else { &mut others };
             for (kind, deviation) in [drive.force_deviation, drive.torque_deviation].into_iter().enumerate() {
                 let variance = deviation.powi(2) * drive.sample_span_s;
                 for i in 0..n {
                     for j in 0..n {
-                        density[(i, j)] += variance * levers[i][kind].dot(&levers[j][kind]);
+                        acting[(i, j)] += variance * levers[i][kind].dot(&levers[j][kind]);
                     }
                 }
             }
         }
         let mass = DMatrix::from_fn(n, n, |i, j| mass[(model.moving[i], model.moving[j])]);
         let inverse = mass.cholesky().ok_or(Failure::Diverged)?.inverse();
-        let density = &inverse * density * inverse * model.noise_scale;
-        let h = span[1] - span[0];
-        let share = [[h * h * h / 3.0, h * h / 2.0], [h * h / 2.0, h]];
-        Ok(DMatrix::from_fn(2 * n, 2 * n, |i, j| share[i / n][j / n] * density[(i % n, j % n)]))
+        let floor = DMatrix::from_fn(n, n, |i, j| if i == j { self.floor[i] } else { 0.0 });
+        let density = &inverse * (&sensed + others + floor) * &inverse * model.noise_scale;
+        Ok((gathered(&density, span[1] - span[0]), sensed))
     }
 }
 

@@ -4,6 +4,7 @@
 //! numbers are part of the same Gaussian with the kinematic fit's covariance as their prior, so that
 //! an error of an axis moves all windows' results alike.
 
+mod attenuation;
 mod batch;
 mod innovations;
 mod layout;

@@ -40,6 +40,8 @@ struct ExactWindow<'a> {
     window: WindowFit<'a>,
     noise_scale: f64,
     reduction: f64,
+    /// By how much the cost grows with each number for the readings' noise in its derivative, at the mean.
+    attenuation: DVector<f64>,
     /// Where its dynamic numbers are among all, and the kinematic ones.
     places: Vec<usize>,
     kinematic: Vec<usize>,
@@ -56,8 +58,11 @@ impl ExactWindow<'_> {
             numbers[at] = x[place] + shift[i];
         }
         let innovations = self.window.model(self.noise_scale).linearize(&numbers, &self.window.active)?;
-        let value = -(innovations.cost() + innovations.half_log_determinant) / self.reduction;
-        let slope = normal_equations(&innovations, self.window.active.len()).1 / -self.reduction;
+        let off = DVector::from_iterator(shift.len(), self.window.active.iter().map(|&at| numbers[at]));
+        let cost = innovations.cost() + innovations.half_log_determinant + self.attenuation.dot(&off);
+        let value = -cost / self.reduction;
+        let gradient = normal_equations(&innovations, self.window.active.len()).1 + &self.attenuation;
+        let slope = gradient / -self.reduction;
         let kinematic = self.sensitivity.transpose() * &slope;
         Ok((value, slope, kinematic))
     }
@@ -138,6 +143,7 @@ impl DynamicsLearner {
                 kinematic: columns.iter().map(|&c| errors[c]).collect(),
                 sensitivity: whole.select_columns(&columns),
                 noise_scale,
+                attenuation: fitted.attenuation,
                 reduction: fitted.reduction,
                 window,
             });

@@ -8,7 +8,7 @@
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
-use super::innovations::{Gain, Innovations, WindowModel, normal_equations};
+use super::innovations::{Innovations, WindowModel, normal_equations};
 use super::layout::{FRICTION, Mechanism};
 use super::track::{JointTrack, TrackKinematics, TrackSource, joint_track};
 use crate::inference::{Failure, Gaussian, LeastSquares, Linearization, Solution, SolverSettings, solve};
@@ -53,6 +53,8 @@ pub struct FittedWindow {
     pub noise_scale: f64,
     /// Innovations at the optimum.
     pub innovations: Innovations,
+    /// By how much the cost there grows with each number for the readings' noise in its derivative.
+    pub attenuation: DVector<f64>,
     /// Log density of the window's observations by the cavity (Laplace), up to a constant of the
     /// observations.
     pub log_predictive: f64,
@@ -67,8 +69,10 @@ struct Problem<'a> {
     model: WindowModel<'a>,
     active: &'a [usize],
     x: Vec<f64>,
-    gains: Vec<Gain>,
     latest: Innovations,
+    /// The point of the last linearization, and how the cost grows from there for the readings' noise.
+    linearized: DVector<f64>,
+    attenuation: DVector<f64>,
 }
 
 impl Problem<'_> {
@@ -82,18 +86,19 @@ impl Problem<'_> {
 impl LeastSquares for Problem<'_> {
     fn linearize(&mut self, x: &DVector<f64>) -> Result<Linearization, Failure> {
         self.set(x);
-        let innovations = self.model.linearize(&self.x, self.active)?;
+        let (innovations, noise) = self.model.linearize_with_noise(&self.x, self.active)?;
         let (curvature, gradient) = normal_equations(&innovations, self.active.len());
-        let cost = innovations.cost();
-        self.gains = innovations.gains.clone();
+        let mut result = Linearization { cost: innovations.cost(), gradient, curvature };
+        self.attenuation = noise.take_out(&mut result)?;
+        self.linearized.clone_from(x);
         self.latest = innovations;
-        Ok(Linearization { cost, gradient, curvature })
+        Ok(result)
     }
 
     fn cost(&mut self, x: &DVector<f64>) -> Result<f64, Failure> {
         self.set(x);
-        let residuals = self.model.residuals(&self.x, &self.gains)?;
-        Ok(0.5 * residuals.iter().map(|e| e * e).sum::<f64>())
+        let residuals = self.model.residuals(&self.x, &self.latest.gains)?;
+        Ok(0.5 * residuals.iter().map(|e| e * e).sum::<f64>() + self.attenuation.dot(&(x - &self.linearized)))
     }
 }
 
@@ -158,6 +163,7 @@ impl WindowFit<'_> {
                 noise_scale: scale,
                 log_predictive: solution.log_evidence - innovations.half_log_determinant - scale_cost(scale),
                 innovations,
+                attenuation: problem.attenuation,
                 solution,
                 steps: spent,
             });
@@ -200,8 +206,9 @@ impl WindowFit<'_> {
             model: self.model(scale),
             active: &self.active,
             x: self.base.clone(),
-            gains: Vec::new(),
             latest: Innovations::default(),
+            linearized: DVector::zeros(0),
+            attenuation: DVector::zeros(0),
         }
     }
 

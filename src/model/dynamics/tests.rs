@@ -238,6 +238,19 @@ fn single_joints_are_recovered() {
     }
 }
 
+/// A light lever is driven by the sensor's noise as much as by the hand.
+#[test]
+fn the_readings_noise_is_not_taken_for_inertia() {
+    let truth = Truth::single(true, 0.05, 0.1, 0.1);
+    let inertia = truth.tree.joint_inertia(0);
+    let found: Vec<_> = (0..8)
+        .map(|seed| truth.learn(3, &mut ChaCha8Rng::seed_from_u64(seed)).joints[0].joint_inertia.clone())
+        .collect();
+    let held = found.iter().filter(|quantity| quantity.q05 < inertia && inertia < quantity.q95).count();
+    let error = found.iter().map(|quantity| (quantity.median / inertia).ln()).sum::<f64>() / found.len() as f64;
+    assert!(held >= 6 && error.abs() < 0.1, "{held} of {} hold, {error:+.2} in all: {found:?}", found.len());
+}
+
 /// While other windows were wrong, a window may have been taken for noise.
 #[test]
 fn a_window_taken_for_noise_is_looked_at_again() {
