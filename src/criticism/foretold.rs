@@ -107,6 +107,11 @@ impl Foretold {
         self.windows.last().is_some_and(|window| window.noise_scale >= MISFIT)
     }
 
+    /// Whether there are enough to judge.
+    pub const fn is_judged(&self) -> bool {
+        self.windows.len() >= 2
+    }
+
     /// Whether something is missing there.
     pub fn is_unexplained(&self) -> bool {
         self.findings.as_ref().is_some_and(|findings| findings.verdict == Verdict::Unexplained)
@@ -154,7 +159,7 @@ impl Foretold {
         findings.before = by_joint.iter().map(|(k, scores)| row(&fit.joints[*k], scores)).collect();
         findings.before.sort_by_key(|row| row.label);
         findings.after.clone_from(&findings.before);
-        if self.windows.len() < 2 {
+        if !self.is_judged() {
             return findings;
         }
         findings.verdict = if missing.is_empty() { Verdict::Adequate } else { Verdict::Unexplained };

@@ -22,6 +22,9 @@ const HORIZON_S: f64 = 0.5;
 const SLACK: f64 = 0.05;
 /// By how much it has to fall where streams are left out: what is of the object is there in every stream.
 const OF_STREAMS: f64 = 0.1;
+/// Of a joint that others carry, and whose readings hold their errors, it has to fall by that, too, unless the
+/// evidence is this great \[nats\].
+const CLEAR_GAIN: f64 = 20.0;
 
 /// Squares of what windows left out lack.
 #[derive(Clone, Debug, Default)]
@@ -30,6 +33,8 @@ pub struct HeldOut {
     lacks: BTreeMap<usize, BTreeMap<usize, Lack>>,
     /// Whether whole streams were left out.
     streams: bool,
+    /// Joints that others carry.
+    carried: Vec<usize>,
     /// Linearizations of all windows spent.
     pub steps: usize,
 }
@@ -46,7 +51,9 @@ impl HeldOut {
     /// Leaves windows out of the selected model's fit in turn.
     pub fn of(workshop: &Workshop<'_>, batch: &[BatchWindow], selection: &Selection) -> Result<Self, Failure> {
         let hypothesis = workshop.hypothesis(&selection.additions)?;
-        let mut all = Self::default();
+        let is_carried = |joint: &usize| workshop.fit.joints[*joint].parent.is_some();
+        let carried = (0..workshop.fit.joints.len()).filter(is_carried).collect();
+        let mut all = Self { carried, ..Self::default() };
         for component in &selection.components {
             let x = selection.numbers.laid_out(&hypothesis, &selection.additions);
             all.add(&hypothesis, &x, component, batch)?;
@@ -127,9 +134,11 @@ impl HeldOut {
         (!ratios.is_empty()).then(|| [mean(0), mean(1)])
     }
 
-    /// Whether windows left out are simulated no worse than by another model, as far as these joints go.
-    pub fn holds_against(&self, before: &Self, joints: &[usize]) -> bool {
-        let slack = if self.streams { -OF_STREAMS } else { SLACK };
+    /// Whether windows left out are simulated no worse than by another model with less evidence by `gain` \[nats\], as
+    /// far as these joints go.
+    pub fn holds_against(&self, before: &Self, joints: &[usize], gain: f64) -> bool {
+        let is_doubtful = || gain < CLEAR_GAIN && joints.iter().any(|joint| self.carried.contains(joint));
+        let slack = if self.streams || is_doubtful() { -OF_STREAMS } else { SLACK };
         self.ratios_to(before, joints).is_none_or(|[all, usual]| 0.5 * (all + usual) < slack)
     }
 }
@@ -146,6 +155,8 @@ impl Lack {
 mod tests {
     use super::*;
 
+    const GAIN: f64 = 10.0;
+
     /// Lacks of force and position by joint, one for each window.
     fn held_out(of_joints: &[(usize, &[f64])]) -> HeldOut {
         let windows = |own: &[f64]| {
@@ -159,22 +170,30 @@ mod tests {
     fn one_joint_does_not_stand_up_for_another() {
         let before = held_out(&[(0, &[1.0; 4]), (1, &[1.0; 4])]);
         let after = held_out(&[(0, &[0.2; 4]), (1, &[1.1; 4])]);
-        assert!(after.holds_against(&before, &[0, 1]), "a sensor's error concerns both");
-        assert!(after.holds_against(&before, &[0]));
-        assert!(!after.holds_against(&before, &[1]));
+        assert!(after.holds_against(&before, &[0, 1], GAIN), "a sensor's error concerns both");
+        assert!(after.holds_against(&before, &[0], GAIN));
+        assert!(!after.holds_against(&before, &[1], GAIN));
     }
 
     #[test]
     fn what_helps_one_window_and_harms_the_others_does_not_hold() {
         let before = held_out(&[(0, &[1.0, 1.0, 1.0, 1.0])]);
-        assert!(!held_out(&[(0, &[0.9, 1.15, 1.15, 1.15])]).holds_against(&before, &[0]));
-        assert!(held_out(&[(0, &[0.5, 1.01, 1.01, 1.01])]).holds_against(&before, &[0]));
+        assert!(!held_out(&[(0, &[0.9, 1.15, 1.15, 1.15])]).holds_against(&before, &[0], GAIN));
+        assert!(held_out(&[(0, &[0.5, 1.01, 1.01, 1.01])]).holds_against(&before, &[0], GAIN));
+    }
+
+    #[test]
+    fn what_helps_no_window_left_out_of_a_joint_that_others_carry_needs_more_evidence() {
+        let before = held_out(&[(0, &[1.0; 4])]);
+        let [same, better] = [1.0, 0.8].map(|lack| HeldOut { carried: vec![0], ..held_out(&[(0, &[lack; 4])]) });
+        assert!(!same.holds_against(&before, &[0], GAIN) && same.holds_against(&before, &[0], 2.0 * CLEAR_GAIN));
+        assert!(better.holds_against(&before, &[0], GAIN));
     }
 
     #[test]
     fn nothing_left_out_says_nothing() {
         let none = HeldOut::default();
         assert_eq!(none.ratios_to(&held_out(&[(0, &[1.0])]), &[0]), None);
-        assert!(none.holds_against(&HeldOut::default(), &[0]));
+        assert!(none.holds_against(&HeldOut::default(), &[0], GAIN));
     }
 }

@@ -53,6 +53,12 @@ pub struct Critic {
     /// Windows since the last review that were foretold.
     #[serde(default)]
     foretold: Foretold,
+    /// Whether the last review found what no window told but those that it was learned of.
+    #[serde(default)]
+    guesses: bool,
+    /// Whether the last review failed.
+    #[serde(default)]
+    failed: bool,
     /// Whether reviews look at windows of several joints that clouds see: from when such are not explained on, unless
     /// nothing is found then.
     #[serde(default)]
@@ -86,7 +92,11 @@ pub struct Stage {
 impl Critic {
     /// What was found by the last review and by windows that were foretold.
     pub fn findings(&self) -> Criticism {
-        self.foretold.joined_to(self.findings.as_ref())
+        let mut all = self.foretold.joined_to(self.findings.as_ref());
+        if self.failed && all.verdict == Verdict::Adequate {
+            all.verdict = Verdict::Unexplained;
+        }
+        all
     }
 
     /// The newest window, not learned yet, as what was learned so far foretells it; `None` where it is reviewed in
@@ -111,14 +121,16 @@ impl Critic {
     ) -> bool {
         let is_foretold = newest.is_some();
         self.foretold.take(newest, learner, fit, input);
-        if self.costly { !is_foretold || self.foretold.newest_misfits() } else { self.foretold.is_unexplained() }
+        if self.costly {
+            !is_foretold || self.foretold.newest_misfits()
+        } else {
+            self.foretold.is_unexplained() || (is_foretold && self.guesses && self.foretold.is_judged())
+        }
     }
 
     /// After a review that failed: what was found before stands, but not that it was enough.
-    pub fn note_failure(&mut self) {
-        if let Some(findings) = self.findings.as_mut().filter(|findings| findings.verdict == Verdict::Adequate) {
-            findings.verdict = Verdict::Unexplained;
-        }
+    pub const fn note_failure(&mut self) {
+        self.failed = true;
     }
 
     /// Looks at all windows so far, of which the newest was `foretold`; effects that they call for are in the
@@ -162,7 +174,7 @@ impl Critic {
         let known_joints = known.is_some();
         let added = known.map_or_else(BTreeMap::new, |(_, numbers)| numbers.added.clone());
         let numbers = Numbers { joints, sensor, added };
-        let (selected, findings, with, seed) = {
+        let (selected, findings, with, seed, guesses) = {
             let workshop =
                 Workshop { learner, fit, input, rest_prior: rest_prior.clone(), sensor_scales: SENSOR_SCALES, spans };
             let found = self.stages.last().map(|step| step.additions.clone()).unwrap_or_default();
@@ -208,9 +220,11 @@ impl Critic {
                 parts_with(batch, &selected)
                     .filter(|part| part.windows.iter().all(|w| !before.densities.contains_key(w))),
             );
+            let all_found = selected.rivals.len();
             if !unscored.is_empty() {
                 selected = selector.restored(selected, &base, &unscored, false)?;
             }
+            let scored = selected.rivals.len();
             let mut published = published(&workshop, batch, &selected)?;
             let of_axes = explained_by_axes(&published.1, fit);
             if !of_axes.is_empty() {
@@ -245,6 +259,7 @@ impl Critic {
                     unknown.iter().map(|joint| findings::unknown(&fit.joints[*joint], left(joint))).collect();
             }
             let found = findings.verdict != Verdict::Insufficient && !nothing_found;
+            let guesses = scored < all_found || (!nothing_found && !found);
             let with = if found {
                 findings.effects = published.1;
                 published.0
@@ -255,12 +270,13 @@ impl Critic {
                 None
             };
             self.adopted = found;
-            (selected, findings, with, seed)
+            (selected, findings, with, seed, guesses)
         };
         if let Some(with) = with {
             *learner = with;
         }
         let steps = selected.steps;
+        (self.guesses, self.failed) = (guesses, false);
         let is_scored = findings.verdict != Verdict::Insufficient;
         self.known = Some((labels, seed.0));
         self.stages = seed.1;

@@ -95,9 +95,8 @@ impl Selector<'_> {
                 // A right effect can gain nothing until its partner is in.
                 match self.pair(&current, best, friction_declared, least)? {
                     Some(pair) => {
-                        let Some(after) = self.holding(&pair, &held_out, &current.additions, &mut current.steps) else {
-                            break;
-                        };
+                        let had = (&current.additions, current.log_evidence);
+                        let Some(after) = self.holding(&pair, &held_out, had, &mut current.steps) else { break };
                         held_out = after;
                         current = Selection { steps: current.steps, ..pair };
                         self.settle(&mut current)?;
@@ -114,7 +113,8 @@ impl Selector<'_> {
             for trial in std::iter::once(best).chain(others).take(HELD_OUT_TRIES) {
                 let mut next = current.clone();
                 self.take(&mut next, trial);
-                if let Some(after) = self.holding(&next, &held_out, &current.additions, &mut current.steps) {
+                let had = (&current.additions, current.log_evidence);
+                if let Some(after) = self.holding(&next, &held_out, had, &mut current.steps) {
                     taken = Some((trial, next, after));
                     break;
                 }
@@ -153,12 +153,12 @@ impl Selector<'_> {
     }
 
     /// What windows left out lack by a model; none where it does not hold there against the one before it, with
-    /// the additions `had`, as far as the joints go that move with those in which the two differ.
+    /// the additions `had` and its evidence, as far as the joints go that move with those in which the two differ.
     pub(super) fn holding(
         &self,
         next: &Selection,
         before: &HeldOut,
-        had: &BTreeSet<Addition>,
+        (had, log_evidence): (&BTreeSet<Addition>, f64),
         steps: &mut usize,
     ) -> Option<HeldOut> {
         let after = HeldOut::of(self.workshop, self.batch, next).ok()?;
@@ -166,7 +166,7 @@ impl Selector<'_> {
         let joints = self.concerned(had.symmetric_difference(&next.additions));
         let ratios = after.ratios_to(before, &joints);
         tracing::debug!(additions = ?next.additions, ?ratios, kappa = ?next.noise_scales_of(None), "left out");
-        after.holds_against(before, &joints).then_some(after)
+        after.holds_against(before, &joints, next.log_evidence - log_evidence).then_some(after)
     }
 
     /// The joints that move in the windows that additions concern.

@@ -84,7 +84,8 @@ impl Selector<'_> {
             }
             let mut next = current.clone();
             self.take(&mut next, &trial);
-            let Some(after) = self.holding(&next, &held_out, &current.additions, &mut current.steps) else { continue };
+            let had = (&current.additions, current.log_evidence);
+            let Some(after) = self.holding(&next, &held_out, had, &mut current.steps) else { continue };
             held_out = after;
             current = Selection { steps: current.steps, ..next };
             current.rivals.insert(addition, vec![(None, -trial.gain)]);
