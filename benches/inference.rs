@@ -93,7 +93,7 @@ fn windows() -> Vec<ClosedWindow> {
         for input in ingest.push(&message.topic.name, &message.topic.type_name, message.bytes()) {
             for output in pipeline.push(input) {
                 if let Output::WindowClosed(window) = output {
-                    pipeline.adopt(&Worker::default().learn((*window).clone()));
+                    pipeline.adopt(&Worker::default().learn((*window).clone(), |_| ()));
                     closed.push(*window);
                 }
             }
@@ -106,5 +106,5 @@ fn windows() -> Vec<ClosedWindow> {
 #[divan::bench(args = [0, 2, 4], sample_count = 5, sample_size = 1)]
 fn window_inference(bencher: Bencher, learned_before: usize) {
     let windows = windows();
-    bencher.bench_local(|| Worker::default().learn(black_box(windows[learned_before].clone())));
+    bencher.bench_local(|| Worker::default().learn(black_box(windows[learned_before].clone()), |_| ()));
 }

@@ -81,7 +81,7 @@ fn run(scene: &Scene, seconds: f64, rate_hz: f64, live: bool) {
         for work in closed {
             let taught = match work {
                 Output::FirstLook(look) => Taught::Models(worker.look(&look)),
-                Output::WindowClosed(window) => Taught::Window(Box::new(worker.learn(*window))),
+                Output::WindowClosed(window) => Taught::Window(Box::new(worker.learn(*window, |_| ()))),
                 _ => continue,
             };
             if results.send(taught).is_err() {

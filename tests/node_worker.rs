@@ -47,6 +47,16 @@ fn live(lag: usize) -> Live {
     let (mut pipeline, mut worker) = (pipeline(true), Worker::default());
     let mut waiting: VecDeque<(usize, Box<ClosedWindow>)> = VecDeque::new();
     let (mut predicted, mut ends, mut learned) = (Vec::new(), Vec::new(), None);
+    // Told twice: before physics are reviewed and after.
+    let mut learn = |window: ClosedWindow, pipeline: &mut Pipeline| {
+        let (mut first, count) = (None, pipeline.posterior().map_or(0, |posterior| posterior.windows.len()));
+        let result = worker.learn(window, |learned| first = Some(learned));
+        let first = first.expect("what is known before the review");
+        pipeline.adopt(&first);
+        assert_eq!(first.posterior.windows.len(), count + 1);
+        pipeline.adopt(&result);
+        learned = Some(result.posterior);
+    };
     let mut take = |outputs: Vec<Output>, waiting: &mut VecDeque<_>, at: usize| {
         for output in outputs {
             match output {
@@ -62,16 +72,12 @@ fn live(lag: usize) -> Live {
     for (at, input) in inputs().into_iter().enumerate() {
         take(pipeline.push(input), &mut waiting, at);
         while let Some((_, window)) = waiting.pop_front_if(|(due, _)| *due <= at) {
-            let result = worker.learn(*window);
-            pipeline.adopt(&result);
-            learned = Some(result.posterior);
+            learn(*window, &mut pipeline);
         }
     }
     take(pipeline.finish(), &mut waiting, 0);
     for (_, window) in waiting {
-        let result = worker.learn(*window);
-        pipeline.adopt(&result);
-        learned = Some(result.posterior);
+        learn(*window, &mut pipeline);
     }
     let posterior = pipeline.posterior().unwrap();
     assert_eq!(learned.unwrap(), posterior, "what the worker says is what the pipeline adopted");

@@ -63,7 +63,7 @@ impl Learning {
     pub fn start(
         threads: usize,
         health: SharedHealth,
-        learned: impl Fn(u64, Taught) + Send + 'static,
+        learned: impl Fn(u64, Taught) + Send + Sync + 'static,
     ) -> anyhow::Result<Self> {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let threads = if threads == 0 { cores.saturating_sub(1).max(1) } else { threads };
@@ -135,7 +135,7 @@ impl Learning {
         queue.waiting.pop_front()
     }
 
-    fn learn_all(&self, pool: &ThreadPool, learned: &impl Fn(u64, Taught)) {
+    fn learn_all(&self, pool: &ThreadPool, learned: &(impl Fn(u64, Taught) + Sync)) {
         give_way();
         let (mut worker, mut life, mut walls_s) = (Worker::default(), 0, Vec::new());
         while let Some(job) = self.next() {
@@ -150,18 +150,21 @@ impl Learning {
                     learned(life, Taught::Models(models));
                 }
                 Work::Window(window) => {
-                    learned(life, Taught::Window(self.learn(pool, &mut worker, *window, &mut walls_s)));
+                    let tell = |window| learned(life, Taught::Window(window));
+                    tell(self.learn(pool, &mut worker, *window, &mut walls_s, tell));
                 }
             }
         }
     }
 
+    /// Learns a window. `tell` gets what it says before what is known is reviewed, which may take far longer.
     fn learn(
         &self,
         pool: &ThreadPool,
         worker: &mut Worker,
         window: ClosedWindow,
         walls_s: &mut Vec<f64>,
+        tell: impl Fn(Box<Learned>) + Sync,
     ) -> Box<Learned> {
         let begin = now();
         let waiting = self.lock().waiting.len();
@@ -170,18 +173,30 @@ impl Learning {
             health.inference.since = Some(begin);
             health.inference.waiting = waiting;
         }
-        let mut result = Box::new(pool.install(|| worker.learn(window)));
+        walls_s.push(0.0);
+        let mut timed = |mut result: Learned| {
+            if let Some(last) = walls_s.last_mut() {
+                *last = begin.elapsed().as_secs_f64();
+            }
+            for (record, wall_s) in result.posterior.windows.iter_mut().zip(&*walls_s) {
+                record.inference_wall_s = *wall_s;
+            }
+            Box::new(result)
+        };
+        let (from, to) = window.span_s();
+        let result = pool.install(|| {
+            worker.learn(window, |first| {
+                tell(timed(first));
+                tracing::info!("window of {from:.1} s to {to:.1} s told in {:.1} s", begin.elapsed().as_secs_f64());
+            })
+        });
+        let result = timed(result);
         let took_s = begin.elapsed().as_secs_f64();
-        walls_s.push(took_s);
-        for (record, wall_s) in result.posterior.windows.iter_mut().zip(&*walls_s) {
-            record.inference_wall_s = *wall_s;
-        }
         let mut health = self.health.lock();
         health.inference.since = None;
         health.inference.last_s = took_s;
         health.inference.learned += 1;
         drop(health);
-        let (from, to) = result.span_s;
         tracing::info!("window of {from:.1} s to {to:.1} s learned in {took_s:.1} s");
         result
     }

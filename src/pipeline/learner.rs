@@ -15,7 +15,7 @@ use super::Frame;
 use super::explain::{Baseline, Motion, Scene, explain_contacts, measure_faces, rays_past, travel};
 use super::keyframes::Keyframes;
 use super::poses::{POSED_RADIUS, PosedPart, measured_motion};
-use crate::criticism::Critic;
+use crate::criticism::{Critic, ForetoldWindow};
 use crate::geometry::{HullProperties, hull_properties};
 use crate::inference::SamplingSettings;
 use crate::math::Pose;
@@ -428,8 +428,8 @@ impl Learner {
 
     /// What the same window says of dynamics, and what those lack.
     pub(super) fn learn_physics(&mut self, job: &WindowJob, contacts: &[Contact]) {
-        self.learn_dynamics(job, contacts);
-        self.record(job);
+        let foretold = self.learn_dynamics(job, contacts);
+        self.review(job, contacts, foretold);
     }
 
     /// Takes over the physics of one that has learned them of all windows but the newest.
@@ -450,27 +450,48 @@ impl Learner {
         relative.next().is_some_and(|first| relative.all(|place| travel(model, &first, &place) < RESTS))
     }
 
-    fn learn_dynamics(&mut self, job: &WindowJob, contacts: &[Contact]) {
-        let Some(fit) = &self.fit else {
+    /// What a window says of the dynamics by the physics known so far. Returns how it was foretold, for its review.
+    pub(super) fn learn_dynamics(&mut self, job: &WindowJob, contacts: &[Contact]) -> Option<ForetoldWindow> {
+        let mut foretold = None;
+        if let Some(fit) = &self.fit {
+            self.zero = Some(job.zero);
+            let windows: Vec<&WindowObservations> = self.windows.iter().collect();
+            let input = DynamicsInput {
+                windows: &windows,
+                contacts,
+                zero: job.zero,
+                parts: &self.hulls,
+                use_tool: self.use_tool,
+            };
+            let before = self.critic.foretell(&self.dynamics, fit, &input);
+            let inference = self.dynamics.learn_window(fit, &input);
+            foretold = before.map(|window| window.learned(&inference));
+            self.inferences.push(inference);
+        } else {
             self.inferences.push(WindowInference::default());
             self.dynamics.keep_window(contacts);
-            return;
-        };
-        self.zero = Some(job.zero);
+        }
+        self.record(job);
+        foretold
+    }
+
+    /// What the dynamics lack, by all windows so far.
+    pub(super) fn review(&mut self, job: &WindowJob, contacts: &[Contact], foretold: Option<ForetoldWindow>) {
+        let Some(fit) = &self.fit else { return };
         let windows: Vec<&WindowObservations> = self.windows.iter().collect();
         let input =
             DynamicsInput { windows: &windows, contacts, zero: job.zero, parts: &self.hulls, use_tool: self.use_tool };
-        let foretold = self.critic.foretell(&self.dynamics, fit, &input);
-        let mut inference = self.dynamics.learn_window(fit, &input);
-        let foretold = foretold.map(|window| window.learned(&inference));
-        match self.critic.review(&mut self.dynamics, fit, &input, foretold) {
-            Ok(steps) => inference.steps += steps,
-            Err(failure) => {
-                tracing::info!(%failure, "no physics could be fitted to all windows: they are not called adequate");
-                self.critic.note_failure();
-            }
+        let steps = self.critic.review(&mut self.dynamics, fit, &input, foretold).unwrap_or_else(|failure| {
+            tracing::info!(%failure, "no physics could be fitted to all windows: they are not called adequate");
+            self.critic.note_failure();
+            0
+        });
+        if let Some(inference) = self.inferences.last_mut() {
+            inference.steps += steps;
         }
-        self.inferences.push(inference);
+        if let Some(record) = self.records.last_mut() {
+            record.steps += steps;
+        }
     }
 
     /// The dynamics as they are published: by the engine that was asked for.

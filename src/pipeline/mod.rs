@@ -476,7 +476,8 @@ impl Pipeline {
         while let Some((_, poses)) = self.handed_out.pop_front_if(|(number, _)| *number <= learned.sequence) {
             at_close = poses;
         }
-        for (label, learned_pose) in &learned.learner.displacements {
+        let displacements = (!learned.again).then_some(&learned.learner.displacements);
+        for (label, learned_pose) in displacements.into_iter().flatten() {
             let since = match (at_close.get(label), self.current.get(label)) {
                 (Some(before), Some(now)) if before != now => *now * before.inverse(),
                 _ => Pose::identity(),

@@ -56,17 +56,13 @@ impl ClosedWindow {
     }
 }
 
-impl std::fmt::Debug for Learned {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Learned").field("span_s", &self.span_s).finish_non_exhaustive()
-    }
-}
-
 /// What a worker knows after a window.
 #[derive(Clone)]
 pub struct Learned {
     /// The last window learned.
     pub(super) sequence: u64,
+    /// Whether this was told before, without its review: where parts are is then known already.
+    pub(super) again: bool,
     /// Everything learned so far, for [`Pipeline::adopt`](super::Pipeline::adopt).
     pub learner: Arc<Learner>,
     /// Its joints, as tracking needs them; `None` without any.
@@ -79,6 +75,12 @@ pub struct Learned {
     pub hulls: BTreeMap<Label, HullProperties>,
     /// Least and greatest position of each joint of the likeliest tree so far, by child \[m or rad\].
     pub ranges_seen: BTreeMap<Label, (f64, f64)>,
+}
+
+impl std::fmt::Debug for Learned {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Learned").field("span_s", &self.span_s).finish_non_exhaustive()
+    }
 }
 
 /// Models of the parts as they were first seen, for [`Pipeline::adopt_models`](super::Pipeline::adopt_models).
@@ -108,23 +110,37 @@ impl Worker {
         Looked { learner, whole: look.whole }
     }
 
-    /// Learns one window.
-    pub fn learn(&mut self, window: ClosedWindow) -> Learned {
-        let learner = self.learner.get_or_insert_with(|| match &window.begin {
-            Begin::Learner(learner) => Arc::clone(learner),
+    /// Learns one window. `tell` gets what it says by the physics known so far, before these are reviewed.
+    pub fn learn(&mut self, window: ClosedWindow, tell: impl FnOnce(Learned)) -> Learned {
+        let ClosedWindow { sequence, window, begin, world_from_work } = window;
+        let learner = self.learner.get_or_insert_with(|| match begin {
+            Begin::Learner(learner) => learner,
             Begin::FirstLook(look) => Arc::new(look.learner()),
         });
         let span_s = window.span_s();
-        // The stream goes on with the one before meanwhile.
-        Arc::make_mut(learner).learn(&window.window.job());
-        Learned {
-            sequence: window.sequence,
+        let known = |learner: &Arc<Learner>, again: bool| Learned {
+            sequence,
+            again,
             mechanism: mechanism_of(learner),
             learner: Arc::clone(learner),
             span_s,
-            posterior: learner.posterior().carried_by(&window.world_from_work),
-            hulls: hulls(&learner.surfaces(), &window.world_from_work),
+            posterior: learner.posterior().carried_by(&world_from_work),
+            hulls: hulls(&learner.surfaces(), &world_from_work),
             ranges_seen: learner.ranges_seen(),
+        };
+        let job = window.job();
+        // The stream goes on with the one before meanwhile.
+        let learning = Arc::make_mut(learner);
+        let contacts = learning.learn_motion(&job);
+        let foretold = learning.learn_dynamics(&job, &contacts);
+        // Samples are drawn once.
+        let is_told = learning.sampling.is_none();
+        if is_told {
+            tell(known(learner, false));
         }
+        let learning = Arc::make_mut(learner);
+        learning.review(&job, &contacts, foretold);
+        learning.retire();
+        known(learner, is_told)
     }
 }
