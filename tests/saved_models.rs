@@ -181,7 +181,9 @@ fn what_is_no_model_of_this_object_is_refused() {
     let digit = if text.as_bytes()[at] == b'5' { "6" } else { "5" };
     fs::write(&broken, format!("{}{digit}{}", &text[..at], &text[at + 1..])).unwrap();
     failed(&load(&broken), &["broken.json: damaged: the content's SHA-256 is"]);
-    fs::write(&broken, &text[..text.len() / 2]).unwrap();
+    // Cut off, but not within a number.
+    let cut = at + text[at..].find(',').unwrap();
+    fs::write(&broken, &text[..cut]).unwrap();
     failed(&load(&broken), &["broken.json: no saved model: EOF"]);
     fs::write(&broken, text.replacen("bom.model/3", "bom.model/9", 1)).unwrap();
     failed(&load(&broken), &["broken.json: no saved model: schema `bom.model/9`, expected `bom.model/3`"]);

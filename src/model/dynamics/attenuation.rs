@@ -12,11 +12,13 @@ use nalgebra::{DMatrix, DVector};
 
 use super::innovations::{Advance, Gain, Passed, WindowModel, gathered};
 use super::layout::{CENTER, DAMPING, INERTIA, MASS};
-use crate::inference::{Failure, Linearization};
+use crate::inference::{Failure, Gaussian, Linearization};
 use crate::mechanism::{Tree, Workspace};
 
 /// Of no direction is more than this share of what the innovations say taken for noise.
 const MOST: f64 = 0.8;
+/// A number is moved by this at most.
+const FARTHEST: f64 = 0.7;
 /// Step of a difference by a number.
 const DIFFERENCE: f64 = 1e-6;
 
@@ -94,9 +96,17 @@ impl SharedNoise {
         Self { gradient: DVector::zeros(numbers), information: DMatrix::zeros(numbers, numbers) }
     }
 
-    /// Takes it out of a linearization, and says by how much the cost grows with each number for it.
-    pub(super) fn take_out(&self, linearization: &mut Linearization) -> Result<DVector<f64>, Failure> {
-        let share = self.bounded_share(&linearization.curvature)?;
+    /// Takes it out of a linearization, and says by how much the cost grows with each number for it. Where that would
+    /// move a number, with the `prior`, by more than [`FARTHEST`], the linearization says nothing of how far.
+    pub(super) fn take_out(
+        &self,
+        linearization: &mut Linearization,
+        prior: &Gaussian,
+    ) -> Result<DVector<f64>, Failure> {
+        let mut share = self.bounded_share(&linearization.curvature)?;
+        let left = &linearization.curvature - &self.information * share + &prior.precision;
+        let moved = left.cholesky().ok_or(Failure::Singular)?.solve(&(&self.gradient * share));
+        share *= (FARTHEST / moved.amax().max(FARTHEST)).min(1.0);
         let gradient = &self.gradient * share;
         linearization.gradient += &gradient;
         linearization.curvature -= &self.information * share;

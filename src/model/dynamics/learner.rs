@@ -779,6 +779,7 @@ impl DynamicsLearner {
             }
             fitted.steps = spent;
         }
+        let fitted = window_fit.without_noise(fitted, &prior)?;
         let deviations = self.deviations(fit, &involved, input.use_tool || !self.windows[window].contacts.is_empty());
         let sensitivity = window_fit.sensitivity(&fitted, &deviations);
         let factor = self.factor(fit, &window_fit, &fitted, &sensitivity);

@@ -123,6 +123,7 @@ impl DynamicsLearner {
             let prior = conditional.marginal(&window.active)?;
             // One step: the model at the mean, for what is taken as fixed.
             let fitted = window.fit(&prior, &[prior.moments()?.0], Some(noise_scale), 1)?;
+            let fitted = window.without_noise(fitted, &prior)?;
             let touched = input.use_tool || !memory.contacts.is_empty();
             let deviations = self.deviations(fit, &self.involved(fit, moving), touched);
             let whole = window.sensitivity(&fitted, &deviations);

@@ -8,7 +8,7 @@
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
-use super::innovations::{Innovations, WindowModel, normal_equations};
+use super::innovations::{Gain, Innovations, WindowModel, normal_equations};
 use super::layout::{FRICTION, Mechanism};
 use super::track::{JointTrack, TrackKinematics, TrackSource, joint_track};
 use crate::inference::{Failure, Gaussian, LeastSquares, Linearization, Solution, SolverSettings, solve};
@@ -17,6 +17,8 @@ use crate::model::{Axis, KinematicJoint};
 
 /// Process noise is at most this many times what the wrench sensor explains.
 const NOISE_SCALES: [f64; 6] = [1.0, 3.0, 10.0, 30.0, 100.0, 300.0];
+/// A window that needs this much has more than noise in it.
+const LACKING: f64 = 10.0;
 /// Standard deviation of ln κ: the model is expected to be right within a factor of a few.
 const LOG_NOISE_DEVIATION: f64 = 1.5;
 /// Weight, in innovations, of the prior that innovations have unit variance.
@@ -69,10 +71,8 @@ struct Problem<'a> {
     model: WindowModel<'a>,
     active: &'a [usize],
     x: Vec<f64>,
+    gains: Vec<Gain>,
     latest: Innovations,
-    /// The point of the last linearization, and how the cost grows from there for the readings' noise.
-    linearized: DVector<f64>,
-    attenuation: DVector<f64>,
 }
 
 impl Problem<'_> {
@@ -86,19 +86,18 @@ impl Problem<'_> {
 impl LeastSquares for Problem<'_> {
     fn linearize(&mut self, x: &DVector<f64>) -> Result<Linearization, Failure> {
         self.set(x);
-        let (innovations, noise) = self.model.linearize_with_noise(&self.x, self.active)?;
+        let innovations = self.model.linearize(&self.x, self.active)?;
         let (curvature, gradient) = normal_equations(&innovations, self.active.len());
-        let mut result = Linearization { cost: innovations.cost(), gradient, curvature };
-        self.attenuation = noise.take_out(&mut result)?;
-        self.linearized.clone_from(x);
+        let cost = innovations.cost();
+        self.gains = innovations.gains.clone();
         self.latest = innovations;
-        Ok(result)
+        Ok(Linearization { cost, gradient, curvature })
     }
 
     fn cost(&mut self, x: &DVector<f64>) -> Result<f64, Failure> {
         self.set(x);
-        let residuals = self.model.residuals(&self.x, &self.latest.gains)?;
-        Ok(0.5 * residuals.iter().map(|e| e * e).sum::<f64>() + self.attenuation.dot(&(x - &self.linearized)))
+        let residuals = self.model.residuals(&self.x, &self.gains)?;
+        Ok(0.5 * residuals.iter().map(|e| e * e).sum::<f64>())
     }
 }
 
@@ -163,12 +162,27 @@ impl WindowFit<'_> {
                 noise_scale: scale,
                 log_predictive: solution.log_evidence - innovations.half_log_determinant - scale_cost(scale),
                 innovations,
-                attenuation: problem.attenuation,
+                attenuation: DVector::zeros(self.active.len()),
                 solution,
                 steps: spent,
             });
         }
         Err(Failure::Diverged)
+    }
+
+    /// A fit whose linearization is without what the readings' noise pretends. The optimum stays where it is: on the
+    /// way from a start that is far off, what noise pretends is far off, too, as it is where the model lacks something.
+    pub fn without_noise(&self, mut fitted: FittedWindow, prior: &Gaussian) -> Result<FittedWindow, Failure> {
+        if fitted.noise_scale >= LACKING {
+            return Ok(fitted);
+        }
+        let mut x = self.base.clone();
+        for (&at, value) in self.active.iter().zip(fitted.solution.point.iter()) {
+            x[at] = *value;
+        }
+        let (_, noise) = self.model(fitted.noise_scale).linearize_with_noise(&x, &self.active)?;
+        fitted.attenuation = noise.take_out(&mut fitted.solution.linearization, prior)?;
+        Ok(fitted)
     }
 
     /// κ of the greatest likelihood at given parameters, by ascent over the grid; how many
@@ -206,9 +220,8 @@ impl WindowFit<'_> {
             model: self.model(scale),
             active: &self.active,
             x: self.base.clone(),
+            gains: Vec::new(),
             latest: Innovations::default(),
-            linearized: DVector::zeros(0),
-            attenuation: DVector::zeros(0),
         }
     }
 
